@@ -9,6 +9,31 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
+from torchdic.condenser import Condenser
+from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
+from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
+from torchdic.objective import Objective
+from torchdic.prism import Prism
+from torchdic.rays import Rays, launch, trace
+from torchdic.volume import Volume
 
-__all__ = ["Grid"]
+__all__ = [
+    "DRAFT",
+    "REFERENCE",
+    "STANDARD",
+    "Acquisition",
+    "Condenser",
+    "Fidelity",
+    "Grid",
+    "Microscope",
+    "Objective",
+    "Prism",
+    "Rays",
+    "SamplingWarning",
+    "Volume",
+    "image",
+    "image_field",
+    "launch",
+    "trace",
+]

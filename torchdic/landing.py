@@ -1,0 +1,174 @@
+"""Bent rays -> a complex field on the grid, at a reference plane inside the specimen.
+
+Exit rays are extended straight back, in the background, to a plane where the wavefront is smooth and displacements are
+small. There the mesh of rays is rasterised, triangle by triangle; where it folds, the field is the sum over the branches.
+"""
+
+import math
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
+from torchdic.rays import Deviation, axial_momentum, deviation, launch
+from torchdic.volume import Volume
+
+# Rows and columns of rays traced around the array, from where rays may be bent into it.
+MARGIN = 2
+# Least tube area relative to the unperturbed one: a caustic is bright but finite.
+LEAST_TUBE = 1e-3
+
+
+def ray_field(
+    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
+) -> Complex[Tensor, "source y x"]:
+    """Each source's envelope at depth `plane` (µm), from rays traced through the volume.
+
+    Inside a triangle of the mesh the OPD is Σ w_i [W_i + ½ δp_i·(X − x_i)] with barycentric weights w_i, third order in
+    the mesh, and the amplitude is √(p_z0/(p_z·|det ∂x_r/∂x0|)), which conserves energy.
+    """
+    grid, n0 = volume.grid, volume.background
+    p0 = momentum[:, None, None, :]
+    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity)
+    landed = extend(leaving, p0, n0, plane - grid.extent[0] / 2)
+    tube = None
+    if fidelity.amplitude:
+        slant = axial_momentum(n0, p0 + landed.momentum) / axial_momentum(n0, p0)
+        tube = tube_area(landed.position, grid) * slant
+    mesh = _Mesh(grid, landed.position)
+
+    with torch.no_grad():
+        source, triangle, pixel = mesh.covered(landed.position)
+        caustic = _caustic_phase(mesh.edges(leaving.position), mesh.edges(landed.position))[source, triangle]
+
+    def corners(values: Tensor) -> Tensor:
+        return mesh.flat(values)[source[:, None], mesh.triangles[triangle]]
+
+    offset = (pixel[:, None] - mesh.home[mesh.triangles[triangle]]) * mesh.spacing - corners(landed.position)
+    opposite = _cross(offset.roll(-1, 1), offset.roll(-2, 1))
+    area = opposite.sum(-1)
+    weight = opposite / area[:, None]
+    opd = (weight * (corners(landed.opd) + 0.5 * (corners(landed.momentum) * offset).sum(-1))).sum(-1)
+
+    k0 = 2 * math.pi / wavelength
+    amplitude = torch.ones_like(opd)
+    if tube is not None:
+        flat = area / (grid.spacing[1] * grid.spacing[2])
+        smooth = (weight * corners(tube)).sum(-1)
+        # beside a fold the interpolated area may vanish or change sign inside a triangle whose own does not
+        smooth = torch.where(smooth / flat > 0.25, smooth, flat)
+        amplitude = smooth.abs().clamp_min(LEAST_TUBE).rsqrt()
+    if landed.absorbed is not None:
+        amplitude = amplitude * torch.exp(-k0 * (weight * corners(landed.absorbed)).sum(-1))
+    branches = torch.polar(amplitude, k0 * opd + caustic)
+
+    ny, nx = grid.shape[1:]
+    target = (source * ny + pixel[:, 0]) * nx + pixel[:, 1]
+    field = branches.new_zeros(len(momentum) * ny * nx).index_add(0, target, branches)
+    return field.reshape(len(momentum), ny, nx)
+
+
+def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviation:
+    """Rays carried on in the homogeneous background by `distance` (µm) along z; a negative one takes them back."""
+    dp, pz0 = rays.momentum, axial_momentum(n0, p0)
+    p = p0 + dp
+    pz = axial_momentum(n0, p)
+    q = -(dp * (p + p0)).sum(-1) / (pz + pz0)
+    slope = (dp - p0 * (q / pz0)[..., None]) / pz[..., None]
+    lengthening = (dp.square().sum(-1) + q * q) / (2 * pz)
+    return Deviation(rays.position + distance * slope, dp, rays.opd + distance * lengthening, rays.absorbed)
+
+
+def tube_area(displacement: Float[Tensor, "source y x 2"], grid: Grid) -> Float[Tensor, "source y x"]:
+    """det ∂x_r/∂x0, second order in the mesh: a ray tube's signed area over its unperturbed one."""
+    (yy, yx), (xy, xx) = (
+        torch.gradient(displacement[..., axis], spacing=grid.spacing[1:], dim=[1, 2]) for axis in (0, 1)
+    )
+    return (1 + yy) * (1 + xx) - yx * xy
+
+
+class _Mesh:
+    """The rays of a source as a mesh of triangles, two to a cell, wide enough to cover the array."""
+
+    def __init__(self, grid: Grid, displacement: Tensor) -> None:
+        device = displacement.device
+        self.shape = grid.shape[1:]
+        self.spacing = displacement.new_tensor(grid.spacing[1:])
+        my, mx = displacement.shape[1:3]
+        # beyond the traced margin rays are displaced as at its rim, where the index is constant across it
+        rim = torch.ones(my, mx, dtype=torch.bool, device=device)
+        rim[1:-1, 1:-1] = False
+        farthest = float((displacement.detach()[:, rim] / self.spacing).abs().max())
+        extra = max(0, math.ceil(farthest) + 1 - MARGIN)
+        self._rows = torch.arange(-extra, my + extra, device=device)
+        self._columns = torch.arange(-extra, mx + extra, device=device)
+        self.home = torch.cartesian_prod(self._rows, self._columns) - MARGIN
+        vertex = torch.arange(len(self.home), device=device).reshape(my + 2 * extra, mx + 2 * extra)
+        a, b, c, d = vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, :-1], vertex[1:, 1:]
+        self.triangles = torch.stack((torch.stack((a, b, c), -1), torch.stack((d, c, b), -1)), 2).reshape(-1, 3)
+        self._extra, self._size = extra, (my, mx)
+
+    def flat(self, values: Tensor) -> Tensor:
+        """Values at the traced vertices (source, y, x, …) as (source, vertex, …), the outer ones included."""
+        if self._extra:
+            values = values[:, self._rows.clamp(0, self._size[0] - 1)][:, :, self._columns.clamp(0, self._size[1] - 1)]
+        return values.flatten(1, 2)
+
+    def edges(self, displacement: Tensor) -> Tensor:
+        """Two edges of each triangle, (source, triangle, 2, 2) in µm, where rays are displaced so far."""
+        corner = (self.home * self.spacing + self.flat(displacement))[:, self.triangles]
+        return corner[:, :, 1:] - corner[:, :, :1]
+
+    def covered(self, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """All pairs of a triangle and a pixel inside it: source (n,), triangle (n,) and pixel (n, 2).
+
+        A pixel on an edge belongs to one of the two triangles: an edge's side is computed from its vertices in the
+        mesh's order, so both see the same number.
+        """
+        moved = self.home + self.flat(displacement) / self.spacing
+        corner = moved[:, self.triangles]
+        limit = torch.tensor(self.shape, device=moved.device)
+        low = corner.amin(2).ceil().clamp_min(0)
+        high = torch.minimum(corner.amax(2).floor(), limit - 1)
+        extent = (high - low + 1).clamp_min(0).long()
+        count = extent.prod(-1).flatten()
+        pair = torch.repeat_interleave(torch.arange(len(count), device=moved.device), count)
+        within = torch.arange(len(pair), device=moved.device) - (count.cumsum(0) - count)[pair]
+        source, triangle = pair // len(self.triangles), pair % len(self.triangles)
+        width = extent.flatten(0, 1)[pair, 1]
+        offset = torch.stack((within // width, within % width), -1)
+        pixel = low.flatten(0, 1)[pair].long() + offset
+
+        vertex = self.triangles[triangle]
+        inside = torch.ones(len(pair), dtype=torch.bool, device=moved.device)
+        orientation = _cross(*(corner[:, :, 1:] - corner[:, :, :1]).unbind(2))[source, triangle] > 0
+        for first, second in ((0, 1), (1, 2), (2, 0)):
+            one, other = vertex[:, first], vertex[:, second]
+            start, end = moved[source, torch.minimum(one, other)], moved[source, torch.maximum(one, other)]
+            left = _cross(end - start, pixel - start) >= 0
+            inside &= (left == (one < other)) == orientation
+        return source[inside], triangle[inside], pixel[inside]
+
+
+def _caustic_phase(leaving: Tensor, landed: Tensor) -> Tensor:
+    """−π/2 for a caustic crossed on the way to the exit, +π/2 for each crossed on the way back to the reference plane.
+
+    Both meshes are given by two edges of each triangle, (source, triangle, 2, 2).
+    """
+    start, stop = _cross(*leaving.unbind(2)), _cross(*landed.unbind(2))
+    # the area on the way is a parabola in the fraction s of the way: start + slope·s + bend·s²
+    change = landed - leaving
+    bend = _cross(*change.unbind(2))
+    slope = stop - start - bend
+    turning = torch.where(bend == 0, torch.inf, -slope / (2 * bend))
+    lowest = start + slope * turning / 2
+    twice = (start * stop > 0) & (turning > 0) & (turning < 1) & (lowest * start < 0)
+    back = (start * stop < 0).to(start) + 2 * twice.to(start)
+    return (math.pi / 2) * (back - (start < 0).to(start))
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    # vectors (y, x); positive from +x towards +y
+    return a[..., 1] * b[..., 0] - a[..., 0] * b[..., 1]

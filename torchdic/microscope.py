@@ -1,0 +1,237 @@
+"""The whole microscope: from a specimen to the images of its prisms and focus planes."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic.condenser import Condenser
+from torchdic.fidelity import STANDARD, Fidelity
+from torchdic.grid import Grid
+from torchdic.landing import ray_field
+from torchdic.objective import Objective
+from torchdic.prism import Prism
+from torchdic.projection import kept_by_projection, project
+from torchdic.rays import kept_by_rays
+from torchdic.recompute import sum_over_sources
+from torchdic.volume import Volume
+from torchdic.wave import axial_difference, exp_i, kept_by_wave, split_step, to_field, to_spectrum
+
+KEPT = {"projection": kept_by_projection, "rays": kept_by_rays, "wave": kept_by_wave}
+
+
+class SamplingWarning(UserWarning):
+    """The grid is coarser than the light that the microscope lets through."""
+
+
+@dataclass(frozen=True, eq=False)
+class Microscope:
+    """What the microscope is.
+
+    wavelength: in vacuum, µm. objective: None lets every propagating wave through. condenser: None is one axial plane
+    wave. Raises ValueError for a wavelength that isn't positive.
+    """
+
+    wavelength: float
+    objective: Objective | None = None
+    condenser: Condenser | None = None
+
+    def __post_init__(self) -> None:
+        if not (0 < self.wavelength < float("inf")):
+            raise ValueError(f"wavelength {self.wavelength} µm must be above 0")
+
+    @property
+    def reach(self) -> float:
+        """The largest transverse momentum that an image's envelope can hold, NA_o + NA_c."""
+        condenser = 0.0 if self.condenser is None else self.condenser.na
+        return condenser + (0.0 if self.objective is None else self.objective.na)
+
+    def sources(
+        self, fidelity: Fidelity, *, dtype: torch.dtype, device: torch.device
+    ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
+        """Directions n·sinθ (source, 2) of the illumination and their weights (source,), which sum to 1."""
+        condenser = self.condenser or Condenser(0.0)
+        return condenser.sources(fidelity.sources, dtype=dtype, device=device)
+
+
+@dataclass(frozen=True, eq=False)
+class Acquisition:
+    """What was recorded: an image for each prism and each focus plane.
+
+    prisms: Prism settings; None is bright field. focus: depths z_f in µm that are sharp, numbers or 0-d tensors, which
+    are learned. Raises ValueError where either is empty or a focus isn't finite.
+    """
+
+    prisms: Sequence[Prism | None] = (None,)
+    focus: Sequence[float | Tensor] = (0.0,)
+
+    def __post_init__(self) -> None:
+        if len(self.prisms) == 0 or len(self.focus) == 0:
+            raise ValueError("an acquisition needs at least one prism (or None for bright field) and one focus plane")
+        for focus in self.focus:
+            if not math.isfinite(float(focus)):
+                raise ValueError(f"focus {float(focus)} must be a finite depth in µm")
+        object.__setattr__(self, "prisms", tuple(self.prisms))
+        object.__setattr__(self, "focus", tuple(self.focus))
+
+
+def image(
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity = STANDARD
+) -> Float[Tensor, "prism focus y x"]:
+    """Images of a volume, relative to the empty bright field.
+
+    Pixels are the volume's (y, x) voxel centres. Raises ValueError where an aperture exceeds the medium's index; warns
+    with SamplingWarning where the voxels are coarser than the light.
+    """
+    _check_apertures(microscope, float(volume.background))
+    _check_sampling(microscope, volume.grid)
+    pad = fidelity.padding
+    volume = _padded(volume, pad)
+    momentum, weights = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
+    plane = fidelity.reference_plane
+    if fidelity.propagation == "wave":
+        plane = volume.grid.extent[0] / 2
+    elif plane is None:
+        plane = volume.mean_plane()
+
+    def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
+        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity)
+        return form_image(spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition)
+
+    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(acquisition)
+    total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
+    return _cropped(total, pad)
+
+
+def propagate(
+    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
+) -> Complex[Tensor, "source y x"]:
+    """Spectrum of each source's envelope behind the specimen, referred to depth `plane` (the last face for a wave)."""
+    if fidelity.propagation == "wave":
+        return split_step(volume, wavelength, momentum, fidelity)
+    field = project if fidelity.propagation == "projection" else ray_field
+    return to_spectrum(field(volume, wavelength, momentum, plane, fidelity))
+
+
+def image_field(
+    transmission: Tensor,
+    grid: Grid,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    *,
+    background: float | Tensor,
+    fidelity: Fidelity = STANDARD,
+) -> Float[Tensor, "prism focus y x"]:
+    """Images of a thin complex transmission at z = 0, relative to the empty bright field.
+
+    transmission: (y, x), the same for every source, or (source, y, x), each source's own envelope (its tilt removed) in
+    the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
+    the medium. Raises ValueError as `image` does, and where a shape is not the grid's.
+    """
+    _check_apertures(microscope, float(background))
+    _check_sampling(microscope, grid)
+    if not transmission.is_complex():
+        transmission = torch.complex(transmission, torch.zeros_like(transmission))
+    real = transmission.real
+    momentum, weights = microscope.sources(fidelity, dtype=real.dtype, device=real.device)
+    expected = (*((len(weights),) if transmission.ndim == 3 else ()), *grid.shape[1:])
+    if tuple(transmission.shape) != expected:
+        raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
+    n0 = torch.as_tensor(background).to(real)
+    pad = fidelity.padding
+    grid = _wider(grid, pad)
+    spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
+
+    def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
+        return form_image(spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition)
+
+    own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
+    kept = _kept_by_imaging(acquisition)
+    total = sum_over_sources(intensity, (momentum, weights, own), own[0].numel(), kept, fidelity.memory)
+    return _cropped(total, pad)
+
+
+def form_image(
+    spectrum: Complex[Tensor, "source y x"],
+    grid: Grid,
+    background: Tensor,
+    plane: float,
+    momentum: Float[Tensor, "source 2"],
+    weights: Float[Tensor, " source"],
+    microscope: Microscope,
+    acquisition: Acquisition,
+) -> Float[Tensor, "prism focus y x"]:
+    """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
+
+    Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f.
+    """
+    k0 = 2 * math.pi / microscope.wavelength
+    frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    difference, pz = axial_difference(grid, microscope.wavelength, background, momentum)
+    passes = pz > 0
+    if microscope.objective is not None:
+        waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
+        passes = passes & microscope.objective.aperture(waves)
+        phase = microscope.objective.phase(waves)
+        if phase is not None:
+            spectrum = spectrum * exp_i(phase)
+    spectrum = torch.where(passes, spectrum, 0)
+    transfers = [None if prism is None else prism.transfer(frequencies) for prism in acquisition.prisms]
+    images = []
+    for focus in acquisition.focus:
+        sharp = spectrum * exp_i(k0 * (torch.as_tensor(focus).to(difference) - plane) * difference)
+        for transfer in transfers:
+            field = to_field(sharp if transfer is None else sharp * transfer)
+            images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))
+    shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
+    return torch.stack(images).reshape(shape).transpose(0, 1)
+
+
+def _kept_by_imaging(acquisition: Acquisition) -> int:
+    return 12 + len(acquisition.focus) * (6 + 4 * len(acquisition.prisms))
+
+
+def _check_apertures(microscope: Microscope, background: float) -> None:
+    condenser = microscope.condenser
+    apertures = {"objective": microscope.objective, "condenser": condenser}
+    for name, part in apertures.items():
+        if part is not None and part.na > background:
+            raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
+    if condenser is not None:
+        largest = condenser.na if condenser.points is None else float(condenser.points.norm(dim=-1).max())
+        if largest >= background:
+            raise ValueError(f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}")
+
+
+def _check_sampling(microscope: Microscope, grid: Grid) -> None:
+    reach = microscope.reach
+    coarsest = max(d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1 or d == min(grid.spacing))
+    if reach > 0 and coarsest > microscope.wavelength / (2 * reach):
+        warnings.warn(
+            f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "
+            f"{microscope.wavelength / (2 * reach):.3g} µm: the finest detail is lost",
+            SamplingWarning,
+            stacklevel=3,
+        )
+
+
+def _wider(grid: Grid, pad: int) -> Grid:
+    nz, ny, nx = grid.shape
+    return replace(grid, shape=(nz, ny + 2 * pad, nx + 2 * pad))
+
+
+def _padded(volume: Volume, pad: int) -> Volume:
+    if pad == 0:
+        return volume
+    fields = [None if f is None else F.pad(f, (pad,) * 4) for f in (volume.delta, volume.absorption)]
+    assert fields[0] is not None
+    return Volume(_wider(volume.grid, pad), fields[0], volume.background, fields[1])
+
+
+def _cropped(images: Tensor, pad: int) -> Tensor:
+    return images if pad == 0 else images[..., pad:-pad, pad:-pad]

@@ -1,0 +1,168 @@
+"""Rays through a gradient of index: the ray ODE, solved by torchdiffeq.
+
+With z as independent variable and p = n·(transverse direction), p_z = √(n² − |p|²), Fermat's principle reads
+
+    dx/dz = p/p_z,    dp/dz = n ∇⊥n / p_z
+
+(the Hamiltonian form of Kagalwala & Kanade's Eq. 7; their printed Eq. 9 has misprints). Only the deviation from the
+unperturbed ray, straight in the background, is integrated, and the optical path only as its difference W from the
+unperturbed plane wave: the absolute ones would lose the phase to rounding. With δp = p − p0, δx = x − x_straight,
+B = n² − n0² and q = p_z − p_z0 = (B − δp·(p + p0))/(p_z + p_z0):
+
+    dδx/dz = (δp − q p0/p_z0)/p_z,    dW/dz = (B + |δp|² + q²)/(2 p_z).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torchdiffeq import odeint
+
+from torchdic.fidelity import ADAPTIVE, Fidelity
+from torchdic.grid import Grid
+from torchdic.recompute import recompute, slabs
+from torchdic.sampling import SliceSampler, spline_coefficients, window
+from torchdic.volume import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays that cross one plane of constant z.
+
+    position: (…, 2) in µm. momentum: (…, 2), n·(transverse direction). opd: (…) in µm, the difference from each ray's
+    own unperturbed plane wave. absorbed: (…), ∫κ ds in µm along the ray, or None where nothing absorbs.
+    """
+
+    position: Float[Tensor, "*ray 2"]
+    momentum: Float[Tensor, "*ray 2"]
+    opd: Float[Tensor, " *ray"]
+    absorbed: Float[Tensor, " *ray"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """How rays differ from their unperturbed selves at one plane: δx (…, 2), δp (…, 2), W (…), ∫κ ds (…) or None."""
+
+    position: Tensor
+    momentum: Tensor
+    opd: Tensor
+    absorbed: Tensor | None
+
+
+def axial_momentum(background: Tensor, momentum: Float[Tensor, "*ray 2"]) -> Float[Tensor, " *ray"]:
+    """p_z = √(n0² − |p|²) in a homogeneous medium."""
+    return (background**2 - momentum.square().sum(-1)).sqrt()
+
+
+def launch(
+    grid: Grid, momentum: Float[Tensor, "source 2"], background: Tensor, plane: float = 0.0, margin: int = 0
+) -> Rays:
+    """A plane wave per source as rays on the volume's first face, position (source, y, x, 2).
+
+    Unperturbed, they would cross `plane` (µm) at the voxel centres, continued by `margin` rows and columns on each side.
+    """
+    wide = replace(grid, shape=(grid.shape[0], grid.shape[1] + 2 * margin, grid.shape[2] + 2 * margin))
+    y, x = (wide.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
+    landing = torch.stack(torch.meshgrid(y, x, indexing="ij"), -1)
+    p0 = momentum[:, None, None, :]
+    slope = p0 / axial_momentum(background, p0)[..., None]
+    position = landing + slope * (-grid.extent[0] / 2 - plane)
+    return Rays(position, p0.expand_as(position), position.new_zeros(position.shape[:-1]))
+
+
+def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
+    """Rays from the volume's first face, z = −nz·dz/2, to its last, z = +nz·dz/2.
+
+    Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (its momentum at the start, in the
+    background). Raises ValueError where a ray can't go on toward +z: where the index falls to its transverse momentum.
+    """
+    change = deviation(volume, rays, fidelity)
+    slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
+    absorbed = change.absorbed
+    if absorbed is not None and rays.absorbed is not None:
+        absorbed = absorbed + rays.absorbed
+    return Rays(
+        rays.position + slope * volume.grid.extent[0] + change.position,
+        rays.momentum + change.momentum,
+        rays.opd + change.opd,
+        absorbed,
+    )
+
+
+def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
+    """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`."""
+    grid, n0, x0, p0 = volume.grid, volume.background, rays.position, rays.momentum
+    fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
+    if fidelity.interpolation == "cubic":
+        fields = [spline_coefficients(f) for f in fields]
+    slices = [f.unbind(0) for f in fields]
+    face = -grid.extent[0] / 2
+    pz0 = axial_momentum(n0, p0)
+    slope0 = p0 / pz0[..., None]
+
+    def cross(z0: float, z1: float, steps: int, *state: Tensor) -> tuple[Tensor, ...]:
+        near = window(grid, z0, z1, fidelity.interpolation)
+        samplers = [SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices]
+
+        def slope(at: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+            z, dx, dp = float(at), state[0], state[1]
+            position = x0 + slope0 * (z - face) + dx
+            delta, gradient = samplers[0].sample(z, position)
+            n, p = n0 + delta, p0 + dp
+            pz = axial_momentum(n, p)
+            contrast = delta * (2 * n0 + delta)
+            q = (contrast - (dp * (p + p0)).sum(-1)) / (pz + pz0)
+            change = (
+                (dp - slope0 * q[..., None]) / pz[..., None],
+                gradient * (n / pz)[..., None],
+                (contrast + dp.square().sum(-1) + q * q) / (2 * pz),
+            )
+            if len(samplers) == 1:
+                return change
+            kappa, _ = samplers[1].sample(z, position)
+            return (*change, kappa * n / pz)
+
+        ends = torch.tensor((z0, z1), dtype=x0.dtype, device=x0.device)
+        return tuple(s[-1] for s in odeint(slope, state, ends, **_solver_options(fidelity, steps)))
+
+    zero = torch.zeros_like(x0 + p0)
+    state = (zero, zero, *(zero[..., 0] for _ in fields))
+    steps = fidelity.steps or grid.shape[0]
+    crowded = kept_by_rays(grid, fidelity) * zero[..., 0].numel() * zero.element_size() > fidelity.memory
+    for first, last in slabs(steps, split=crowded and fidelity.solver not in ADAPTIVE):
+        z0, z1 = (face + grid.extent[0] * i / steps for i in (first, last))
+        state = recompute(cross, z0, z1, last - first, *state, when=crowded)
+    stopped = ~torch.isfinite(state[2])
+    if bool(stopped.any()):
+        raise ValueError(
+            f"{int(stopped.sum())} of {stopped.numel()} rays can't go on toward +z: "
+            "inside the volume the index falls to their transverse momentum"
+        )
+    return Deviation(state[0], state[1], state[2], state[3] if len(state) == 4 else None)
+
+
+def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:
+    """Values per ray that autograd keeps for the backward pass."""
+    return 200 * (fidelity.steps or grid.shape[0])
+
+
+def _solver_options(fidelity: Fidelity, steps: int) -> dict:
+    if fidelity.solver in ADAPTIVE:
+        # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones
+        return {
+            "method": fidelity.solver,
+            "rtol": fidelity.tolerance,
+            "atol": fidelity.tolerance,
+            "options": {"norm": _largest},
+        }
+
+    def equal_steps(_function: object, _state: object, ends: Tensor) -> Tensor:
+        return torch.cat((ends[:1] + (ends[1] - ends[0]) * torch.arange(steps).to(ends) / steps, ends[1:]))
+
+    return {"method": fidelity.solver, "options": {"grid_constructor": equal_steps}}
+
+
+def _largest(state: Tensor | tuple[Tensor, ...]) -> Tensor:
+    parts = state if isinstance(state, tuple) else (state,)
+    return torch.stack([part.abs().max() for part in parts]).max()

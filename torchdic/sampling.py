@@ -1,0 +1,154 @@
+"""Values and transverse gradients between voxel centres, one slice at a time.
+
+All rays of a source are at the same depth, so a 3-D interpolation is a 2-D one in the slice blended for that depth, and
+its backward pass touches two (linear) or four (cubic) slices instead of the whole volume.
+
+Outside the outermost voxel centres a field is constant, so its gradient there is 0.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from torchdic.grid import Grid
+
+Interpolation = Literal["linear", "cubic"]
+
+
+class SliceSampler:
+    """Samples a field of voxels at one depth and many transverse positions.
+
+    grid: of the whole field. slices: the field's 2-D slices first … first + len(slices) − 1, or, for "cubic", those of
+    its spline coefficients (see `spline_coefficients`).
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        slices: Sequence[Float[Tensor, "y x"]],
+        interpolation: Interpolation,
+        first: int = 0,
+    ) -> None:
+        self.grid, self.slices, self.interpolation, self.first = grid, slices, interpolation, first
+
+    def sample(
+        self, z: float, position: Float[Tensor, "*ray 2"]
+    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, "*ray 2"]]:
+        """The field and its transverse gradient (1/µm) at depth z and positions (…, 2) in µm."""
+        spacing = position.new_tensor(self.grid.spacing[1:])
+        slice_ = self._blend(z)
+        if self.interpolation == "cubic":
+            value, gradient = _sample_cubic(slice_, self._index(position))
+        else:
+            # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
+            padded = F.pad(slice_[None], (2, 2, 2, 2), mode="replicate")[0]
+            gradient_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+            gradient_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
+            channels = torch.stack((padded[1:-1, 1:-1], gradient_y, gradient_x))
+            sampled = _sample_linear(channels, self._index(position) + 1)
+            value, gradient = sampled[0], sampled[1:].movedim(0, -1)
+        return value, gradient / spacing
+
+    def value(self, z: float, position: Float[Tensor, "*ray 2"]) -> Float[Tensor, " *ray"]:
+        """The field alone at depth z and positions (…, 2) in µm."""
+        if self.interpolation == "cubic":
+            return _sample_cubic(self._blend(z), self._index(position))[0]
+        return _sample_linear(self._blend(z)[None], self._index(position))[0]
+
+    def _index(self, position: Tensor) -> Tensor:
+        return torch.stack([position[..., a] / self.grid.spacing[a + 1] + (self.grid.shape[a + 1] - 1) / 2 for a in (0, 1)], -1)
+
+    def _blend(self, z: float) -> Float[Tensor, "y x"]:
+        weights = depth_weights(self.grid, z, self.interpolation)
+        return sum(weight * self.slices[i - self.first] for i, weight in weights.items())  # pyright: ignore[reportReturnType]
+
+
+def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:
+    """The slices that the field at depth z depends on, with their weights."""
+    last = grid.shape[0] - 1
+    index = min(max(grid.index(0, z), 0.0), float(last))
+    base = min(int(index), max(last - 1, 0))
+    t = index - base
+    if interpolation == "linear":
+        taps = {base: 1 - t, base + 1: t}
+    else:
+        taps = dict(zip(range(base - 1, base + 3), _bspline(t), strict=True))
+    weights: dict[int, float] = {}
+    for i, weight in taps.items():
+        if weight != 0:
+            mirrored = _mirror(i, last)
+            weights[mirrored] = weights.get(mirrored, 0.0) + weight
+    return weights
+
+
+def spline_coefficients(field: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+    """Coefficients of the cubic B-spline (C²) that passes through a field's voxel centres, mirrored at its ends."""
+    for axis in range(3):
+        n = field.shape[axis]
+        if n == 1:
+            continue
+        matrix = torch.eye(n, dtype=torch.float64) * 4
+        for i in range(n):
+            for neighbour in (i - 1, i + 1):
+                matrix[i, _mirror(neighbour, n - 1)] += 1
+        inverse = torch.linalg.inv(matrix / 6).to(field)
+        field = torch.tensordot(inverse, field, dims=([1], [axis])).movedim(0, axis)
+    return field
+
+
+def _mirror(i: int, last: int) -> int:
+    if last == 0:
+        return 0
+    return last - abs(last - abs(i))
+
+
+def _bspline(t: float) -> tuple[float, float, float, float]:
+    return ((1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (1 + 3 * t + 3 * t**2 - 3 * t**3) / 6, t**3 / 6)
+
+
+def _sample_linear(channels: Tensor, index: Tensor) -> Tensor:
+    """Channels (c, y, x) at fractional indices (…, 2): shape (c, …)."""
+    size = channels.shape[1:]
+    if 1 in size:  # grid_sample's coordinates, −1 … 1, need two points to stand on
+        channels = channels.repeat_interleave(1 + (size[0] == 1), 1).repeat_interleave(1 + (size[1] == 1), 2)
+    last = index.new_tensor([n - 1 for n in channels.shape[1:]])
+    normalised = (index * (2 / last) - 1).flip(-1).reshape(1, 1, -1, 2)
+    sampled = F.grid_sample(channels[None], normalised, padding_mode="border", align_corners=True)
+    return sampled.reshape(-1, *index.shape[:-1])
+
+
+def _sample_cubic(coefficients: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    taps, weights, slopes = [], [], []
+    for axis, n in enumerate(coefficients.shape):
+        # clamp's gradient is 0 outside, and so are the mirrored spline's slopes at its ends
+        along = index[..., axis].clamp(0, n - 1)
+        base = along.detach().floor().clamp(max=max(n - 2, 0))
+        t = along - base
+        weights.append(
+            torch.stack(((1 - t) ** 3, 4 + t * t * (3 * t - 6), 1 + 3 * t * (1 + t - t * t), t**3), -1) / 6
+        )
+        slopes.append(torch.stack((-((1 - t) ** 2), t * (3 * t - 4), 1 + t * (2 - 3 * t), t * t), -1) / 2)
+        tap = base.long()[..., None] + torch.arange(-1, 3, device=index.device)
+        taps.append((n - 1) - ((n - 1) - tap.abs()).abs() if n > 1 else torch.zeros_like(tap))
+    (wy, wx), (sy, sx) = weights, slopes
+    flat = taps[0][..., :, None] * coefficients.shape[1] + taps[1][..., None, :]
+    patch = coefficients.reshape(-1)[flat]
+    along_x = (patch * wx[..., None, :]).sum(-1)
+    value = (along_x * wy).sum(-1)
+    gradient_y = (along_x * sy).sum(-1)
+    gradient_x = ((patch * sx[..., None, :]).sum(-1) * wy).sum(-1)
+    return value, torch.stack((gradient_y, gradient_x), -1)
+
+
+def window(grid: Grid, z0: float, z1: float, interpolation: Interpolation) -> slice:
+    """The slices that depths z0 … z1 (in either order) depend on, as a range of indices."""
+    reach = 0 if interpolation == "linear" else 1
+    last = grid.shape[0] - 1
+    low, high = sorted((grid.index(0, z0), grid.index(0, z1)))
+    first = min(max(math.floor(low) - reach, 0), max(last - 1 - 2 * reach, 0))
+    return slice(first, min(math.ceil(high) + 1 + reach, last + 1))

@@ -1,0 +1,121 @@
+"""Wave optics on the grid: the split-step solution of the one-way wave equation.
+
+Everything is done on the envelope of each source, its tilt removed: the envelope's frequency f is the field's f + f_s,
+f_s = p0/λ. So the envelope of an unperturbed plane wave is 1.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
+from torchdic.recompute import recompute, slabs
+from torchdic.rays import axial_momentum
+from torchdic.volume import Volume
+
+
+def axial_difference(
+    grid: Grid, wavelength: float, background: Tensor, momentum: Float[Tensor, "source 2"]
+) -> tuple[Float[Tensor, "source y x"], Float[Tensor, "source y x"]]:
+    """p_z(f + f_s) − p_z0 and p_z(f + f_s) of each source's waves; p_z is 0 where a wave is evanescent.
+
+    The difference is formed without cancellation, so float32 keeps the phase of a long path.
+    """
+    deflection = wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    p0 = momentum[:, :, None, None]
+    pz0 = axial_momentum(background, momentum)[:, None, None]
+    squared = background**2 - (p0 + deflection).square().sum(1)
+    propagates = squared > 0
+    # the inner where keeps the square root's infinite slope at 0 out of the gradient
+    pz = torch.where(propagates, torch.where(propagates, squared, 1).sqrt(), 0)
+    return -(deflection * (deflection + 2 * p0)).sum(1) / (pz + pz0), pz
+
+
+def exp_i(phase: Tensor) -> Tensor:
+    """exp(i·phase) of a real phase, or of a complex one where light is absorbed."""
+    return torch.exp(1j * phase) if phase.is_complex() else torch.polar(torch.ones_like(phase), phase)
+
+
+def to_spectrum(field: Tensor) -> Tensor:
+    """Amplitudes of the plane waves that make up a field (…, y, x): 1 at f = 0 for a field of 1."""
+    return torch.fft.fft2(field, norm="forward")
+
+
+def to_field(spectrum: Tensor) -> Tensor:
+    """The field (…, y, x) of the plane waves in a spectrum."""
+    return torch.fft.ifft2(spectrum, norm="forward")
+
+
+def split_step(
+    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], fidelity: Fidelity
+) -> Complex[Tensor, "source y x"]:
+    """Spectrum of each source's envelope on the volume's last face.
+
+    The textbook's phase screen k0·Δn·dz is wrong for oblique light, because the effect of Δn depends on the angle after
+    scattering as well as before: with B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen
+    φ = k0 dz B/(√(n² − |p0|²) + p_z0), exact for a slab along the source, is followed by the factor
+    G² = p_z0/p_z(f + f_s) on what it scatters, to first or second order in φ.
+    """
+    steps = fidelity.steps or volume.grid.shape[0]
+    dz = volume.grid.extent[0] / steps
+    k0, n0, pz0 = 2 * math.pi / wavelength, volume.background, axial_momentum(volume.background, momentum)[:, None, None]
+    deltas = volume.delta.unbind(0)
+    kappas = None if volume.absorption is None else volume.absorption.unbind(0)
+
+    difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
+    H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
+    excess = pz0 / pz.clamp_min(0.1) - 1
+
+    def screen(step: int) -> Tensor:
+        n = n0 + slab_mean(deltas, step, steps)
+        path = (n - n0) * (n + n0)
+        if kappas is not None:
+            kappa = slab_mean(kappas, step, steps)
+            path = torch.complex(path - kappa**2, 2 * n * kappa)
+        return k0 * dz * path / (axial_momentum(n, momentum[:, None, None, :]) + pz0)
+
+    def first_order(phi: Tensor, S: Tensor) -> Tensor:
+        V = S * H
+        scattered = to_spectrum((exp_i(phi) - 1) * to_field(V))
+        return H * (V + (1 + excess) * scattered)
+
+    def second_order(phi: Tensor, S: Tensor) -> Tensor:
+        e = exp_i(phi / 2)
+        u = e * to_field(S * H)
+        a = to_field(excess * to_spectrum(1j * phi * u))
+        return H * to_spectrum(e * (u + a))
+
+    advance = first_order if fidelity.order == 1 else second_order
+
+    def cross(first: int, last: int, S: Tensor) -> Tensor:
+        for step in range(first, last):
+            S = advance(screen(step), S)
+        return S
+
+    S = torch.zeros_like(H)
+    S[:, 0, 0] = 1
+    crowded = kept_by_wave(volume.grid, fidelity) * pz.numel() * pz.element_size() > fidelity.memory
+    for first, last in slabs(steps, split=crowded):
+        S = recompute(cross, first, last, S, when=crowded)
+    return S
+
+
+def kept_by_wave(grid: Grid, fidelity: Fidelity) -> int:
+    """Values per source and pixel that autograd keeps for the backward pass."""
+    return {1: 16, 2: 24}[fidelity.order] * (fidelity.steps or grid.shape[0])
+
+
+def slab_mean(slices: Sequence[Tensor], step: int, steps: int) -> Tensor:
+    """The mean of a field over the given one of `steps` equal slabs through its slices."""
+    n = len(slices)
+    first, last = step * n // steps, -(-(step + 1) * n // steps)
+    if last - first == 1:
+        return slices[first]
+    # slab and slices on a common ruler, steps to the slice
+    overlaps = [min((step + 1) * n, (i + 1) * steps) - max(step * n, i * steps) for i in range(first, last)]
+    total: Tensor = sum(o * slices[first + i] for i, o in enumerate(overlaps))  # pyright: ignore[reportAssignmentType]
+    return total / n
