@@ -147,7 +147,10 @@ class _Mesh:
         for first, second in ((0, 1), (1, 2), (2, 0)):
             one, other = vertex[:, first], vertex[:, second]
             start, end = moved[source, torch.minimum(one, other)], moved[source, torch.maximum(one, other)]
-            left = _cross(end - start, pixel - start) >= 0
+            # taken from the nearer end: a ray that lands almost on a pixel would drown in the rounding of the other
+            direct = (pixel - start).square().sum(-1) <= (pixel - end).square().sum(-1)
+            arm = pixel - torch.where(direct[:, None], start, end)
+            left = torch.where(direct, 1, -1) * _cross(torch.where(direct[:, None], end - start, start - end), arm) >= 0
             inside &= (left == (one < other)) == orientation
         return source[inside], triangle[inside], pixel[inside]
 
