@@ -1,1 +1,34 @@
-"""."""
+"""Specimens with a known answer, to test and to demonstrate the microscope and the reconstruction.
+
+Every specimen is a frozen dataclass in µm with its background index; `delta(grid)` gives Δn and
+`index(grid)` gives n = background + Δn on a grid, (z, y, x). Where an exact answer exists the specimen
+knows it: rays through a layered medium and a graded-index rod, the straight-ray OPD of a Gaussian ball,
+the OPD step of etched glass, and the exact wave field of a bead, so that data for a reconstruction need
+not come from the model that inverts it.
+"""
+
+from data_synthetic.ball import GaussianBall
+from data_synthetic.bead import Bead
+from data_synthetic.cell import CellPhantom, Organelle
+from data_synthetic.ellipsoid import Ellipsoid
+from data_synthetic.exact import scattering_amplitude, sphere_field, sphere_near_field
+from data_synthetic.layered import LayeredMedium
+from data_synthetic.rod import GradedIndexRod
+from data_synthetic.specimen import ExactRays, Specimen
+from data_synthetic.step import EtchedGlassStep
+
+__all__ = [
+    "Bead",
+    "CellPhantom",
+    "Ellipsoid",
+    "EtchedGlassStep",
+    "ExactRays",
+    "GaussianBall",
+    "GradedIndexRod",
+    "LayeredMedium",
+    "Organelle",
+    "Specimen",
+    "scattering_amplitude",
+    "sphere_field",
+    "sphere_near_field",
+]
