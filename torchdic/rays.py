@@ -50,8 +50,10 @@ class Deviation:
     absorbed: Tensor | None
 
 
-def axial_momentum(background: Tensor, momentum: Float[Tensor, "*ray 2"]) -> Float[Tensor, " *ray"]:
-    """p_z = √(n0² − |p|²) in a homogeneous medium."""
+def axial_momentum(
+    background: Float[Tensor, " *#ray"], momentum: Float[Tensor, "*#ray 2"]
+) -> Float[Tensor, " *#ray"]:
+    """p_z = √(n0² − |p|²) where the index is n0."""
     return (background**2 - momentum.square().sum(-1)).sqrt()
 
 
