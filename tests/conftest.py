@@ -1,0 +1,90 @@
+"""Annotations are enforced here, and only here: every call in a test checks the shapes and types it was promised."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import install_import_hook
+
+# int is accepted where float is asked for, as the type checker does (PEP 484's numeric tower).
+install_import_hook(
+    ["torchdic", "data_synthetic"],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+)
+
+from torchdic import Acquisition, Condenser, Grid, Microscope, Objective, Prism  # noqa: E402
+
+DATA = Path(__file__).parent / "data"
+PROPAGATIONS = ("projection", "rays", "wave")
+
+
+@pytest.fixture(autouse=True)
+def _deterministic():
+    """The same numbers in every test, whichever tests ran before it."""
+    torch.manual_seed(0)
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(before)
+
+
+@pytest.fixture(params=PROPAGATIONS)
+def propagation(request) -> str:
+    return request.param
+
+
+@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+def dtype(request) -> torch.dtype:
+    return request.param
+
+
+@pytest.fixture
+def small() -> Grid:
+    """Few voxels, all sizes unequal and both odd and even."""
+    return Grid((4, 11, 14), (0.5, 0.2, 0.21))
+
+
+@pytest.fixture
+def microscope() -> Microscope:
+    """Partially coherent, with an objective wider than its condenser; the small grid samples it well."""
+    return Microscope(0.546, Objective(0.75), Condenser(0.4))
+
+
+@pytest.fixture
+def acquisition() -> Acquisition:
+    """Both shear axes, unequal and tilted, a bright field between them, and focus planes out of order."""
+    return Acquisition([Prism((0.05, 0.21), 1.1), None, Prism((0.17, -0.04), -0.7)], [0.6, -0.9])
+
+
+@pytest.fixture
+def load():
+    """The reference images of tests/data by name, as tensors."""
+
+    def read(name: str) -> dict[str, torch.Tensor]:
+        with np.load(DATA / f"{name}.npz") as file:
+            return {key: torch.from_numpy(np.asarray(file[key])) for key in file.files}
+
+    return read
+
+
+@pytest.fixture
+def smooth_field():
+    """A smooth random field (z, y, x) that is nowhere 0 or alike in any two axes; about ±size."""
+
+    def make(
+        grid: Grid, size: float = 1.0, dtype: torch.dtype = torch.float64, seed: int = 0
+    ) -> torch.Tensor:
+        random = torch.Generator().manual_seed(seed)
+        z, y, x = torch.meshgrid(
+            *(grid.coordinates(axis, dtype=torch.float64) for axis in range(3)), indexing="ij"
+        )
+        field = torch.zeros(grid.shape, dtype=torch.float64)
+        for _ in range(8):
+            fz, fy, fx, phase, part = torch.rand(5, generator=random, dtype=torch.float64).tolist()
+            k = [math.pi * (2 * f - 1) * 0.9 for f in (fz, fy, fx)]
+            field += (0.5 + part) * torch.cos(k[0] * z + k[1] * y + k[2] * x + 2 * math.pi * phase)
+        return (size / 3 * field).to(dtype)
+
+    return make
