@@ -1,0 +1,53 @@
+"""A learned parameter that runs free, and the Δn within bounds that it stands for."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+# Sharpness of softplus: its knee is about 1/200 = 0.005 wide, the scale of a cell's Δn.
+SHARPNESS = 200.0
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Least and greatest Δn; None is no bound. Raises ValueError unless lower < upper.
+
+    A clamp would kill voxels for good once they touch the bound; a smooth map lets them come back.
+    """
+
+    lower: float | None = 0.0
+    upper: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("lower", self.lower), ("upper", self.upper)):
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} bound {value} must be a finite Δn")
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise ValueError(f"lower bound {self.lower} must be below the upper bound {self.upper}")
+
+    def delta(self, parameter: Tensor) -> Tensor:
+        """Δn of a free parameter."""
+        if self.lower is None and self.upper is None:
+            return parameter
+        if self.upper is None:
+            return self.lower + F.softplus(parameter, beta=SHARPNESS)
+        if self.lower is None:
+            return self.upper - F.softplus(-parameter, beta=SHARPNESS)
+        return self.lower + (self.upper - self.lower) * torch.sigmoid(4 * parameter / (self.upper - self.lower))
+
+    def parameter(self, delta: Tensor, margin: float) -> Tensor:
+        """The parameter whose Δn is the given one, kept `margin` away from the bounds so that it can still move."""
+        if self.lower is None and self.upper is None:
+            return delta.clone()
+        if self.upper is None:
+            above = (delta - self.lower).clamp_min(margin)
+            return above + torch.log(-torch.expm1(-SHARPNESS * above)) / SHARPNESS
+        if self.lower is None:
+            below = (self.upper - delta).clamp_min(margin)
+            return -(below + torch.log(-torch.expm1(-SHARPNESS * below)) / SHARPNESS)
+        width = self.upper - self.lower
+        share = ((delta - self.lower) / width).clamp(margin / width, 1 - margin / width)
+        return width / 4 * torch.logit(share)
