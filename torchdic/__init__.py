@@ -9,6 +9,7 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
+from torchdic.camera import Camera
 from torchdic.condenser import Condenser
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
@@ -23,6 +24,7 @@ __all__ = [
     "REFERENCE",
     "STANDARD",
     "Acquisition",
+    "Camera",
     "Condenser",
     "Fidelity",
     "Grid",

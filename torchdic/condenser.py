@@ -62,15 +62,16 @@ class Condenser:
 def disc_quadrature(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 2) in the unit disc and weights (m,) that sum to 1, m ≤ count, for the mean over the disc.
 
-    Rings at the Gauss nodes of r², each with equally spaced azimuths, turned by half a step from ring to ring. K rings
-    of M azimuths are exact for polynomials of degree below min(4K, M).
+    K rings at the Gauss nodes of r², each with M equally spaced azimuths: exact for polynomials of degree below
+    min(4K, M). The rings are turned by half a step against each other, so that what their azimuths miss beyond that, up
+    to about 2M, nearly cancels: K and M are chosen for it, and where they tie more rings are.
     """
     if count < 1:
         raise ValueError(f"a condenser needs at least 1 source, not {count}")
     if count == 1:
         return np.zeros((1, 2)), np.ones(1)
     rings, azimuths = max(
-        ((k, count // k) for k in range(1, count + 1)), key=lambda rule: (min(4 * rule[0], rule[1]), -rule[0])
+        ((k, count // k) for k in range(1, count + 1)), key=lambda rule: (min(2 * rule[0], rule[1]), rule[0])
     )
     nodes, node_weights = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt((1 + nodes) / 2)

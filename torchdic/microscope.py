@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from torchdic.camera import Camera
 from torchdic.condenser import Condenser
 from torchdic.fidelity import STANDARD, Fidelity
 from torchdic.grid import Grid
@@ -34,12 +35,14 @@ class Microscope:
     """What the microscope is.
 
     wavelength: in vacuum, µm. objective: None lets every propagating wave through. condenser: None is one axial plane
-    wave. Raises ValueError for a wavelength that isn't positive.
+    wave. camera: what it records of an image; the images of `image` are noiseless all the same.
+    Raises ValueError for a wavelength that isn't positive.
     """
 
     wavelength: float
     objective: Objective | None = None
     condenser: Condenser | None = None
+    camera: Camera | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.wavelength < float("inf")):
@@ -72,7 +75,9 @@ class Acquisition:
 
     def __post_init__(self) -> None:
         if len(self.prisms) == 0 or len(self.focus) == 0:
-            raise ValueError("an acquisition needs at least one prism (or None for bright field) and one focus plane")
+            raise ValueError(
+                "an acquisition needs at least one prism (or None for bright field) and one focus plane"
+            )
         for focus in self.focus:
             if not math.isfinite(float(focus)):
                 raise ValueError(f"focus {float(focus)} must be a finite depth in µm")
@@ -88,7 +93,7 @@ def image(
     Pixels are the volume's (y, x) voxel centres. Raises ValueError where an aperture exceeds the medium's index; warns
     with SamplingWarning where the voxels are coarser than the light.
     """
-    _check_apertures(microscope, float(volume.background))
+    check_apertures(microscope, float(volume.background))
     _check_sampling(microscope, volume.grid)
     pad = fidelity.padding
     volume = _padded(volume, pad)
@@ -101,7 +106,9 @@ def image(
 
     def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
         spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity)
-        return form_image(spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition)
+        return form_image(
+            spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition
+        )
 
     kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(acquisition)
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
@@ -133,7 +140,7 @@ def image_field(
     the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
     the medium. Raises ValueError as `image` does, and where a shape is not the grid's.
     """
-    _check_apertures(microscope, float(background))
+    check_apertures(microscope, float(background))
     _check_sampling(microscope, grid)
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))
@@ -141,7 +148,9 @@ def image_field(
     momentum, weights = microscope.sources(fidelity, dtype=real.dtype, device=real.device)
     expected = (*((len(weights),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:
-        raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
+        raise ValueError(
+            f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}"
+        )
     n0 = torch.as_tensor(background).to(real)
     pad = fidelity.padding
     grid = _wider(grid, pad)
@@ -196,7 +205,8 @@ def _kept_by_imaging(acquisition: Acquisition) -> int:
     return 12 + len(acquisition.focus) * (6 + 4 * len(acquisition.prisms))
 
 
-def _check_apertures(microscope: Microscope, background: float) -> None:
+def check_apertures(microscope: Microscope, background: float) -> None:
+    """Raise ValueError where an aperture asks for light that the medium's index does not carry."""
     condenser = microscope.condenser
     apertures = {"objective": microscope.objective, "condenser": condenser}
     for name, part in apertures.items():
@@ -205,12 +215,16 @@ def _check_apertures(microscope: Microscope, background: float) -> None:
     if condenser is not None:
         largest = condenser.na if condenser.points is None else float(condenser.points.norm(dim=-1).max())
         if largest >= background:
-            raise ValueError(f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}")
+            raise ValueError(
+                f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"
+            )
 
 
 def _check_sampling(microscope: Microscope, grid: Grid) -> None:
     reach = microscope.reach
-    coarsest = max(d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1 or d == min(grid.spacing))
+    coarsest = max(
+        d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1 or d == min(grid.spacing)
+    )
     if reach > 0 and coarsest > microscope.wavelength / (2 * reach):
         warnings.warn(
             f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "

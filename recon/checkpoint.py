@@ -1,0 +1,52 @@
+"""A descent saved on disk, to go on with after an interruption."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+
+from recon.descend import Step
+from torchdic.files import written_whole
+
+Row = tuple[int, float, float, float]
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that can't be gone on with: one line with the file and the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A step of a descent and the log up to it.
+
+    step: to go on from. rows: (step, misfit, loss, seconds) of every step so far. identity: what the descent depends
+    on, the resolved configuration and the data's digest, line by line.
+    """
+
+    step: Step
+    rows: list[Row]
+    identity: str
+
+
+def save(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint, whole or not at all."""
+    step = {f.name: getattr(checkpoint.step, f.name) for f in fields(Step)}
+    with written_whole(path) as partial:
+        torch.save({"step": step, "rows": checkpoint.rows, "identity": checkpoint.identity}, partial)
+
+
+def load(path: Path, identity: str) -> Checkpoint:
+    """Read a checkpoint of the same configuration and data. Raises CheckpointError where it isn't one."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        checkpoint = Checkpoint(Step(**content["step"]), content["rows"], content["identity"])
+    except Exception as error:
+        raise CheckpointError(f"{path}: is no checkpoint of this version: {error}") from error
+    if checkpoint.identity != identity:
+        theirs, ours = checkpoint.identity.splitlines(), identity.splitlines()
+        changed = next(
+            (f"{a!r} became {b!r}" for a, b in zip(theirs, ours, strict=False) if a != b),
+            "lines were added or removed",
+        )
+        raise CheckpointError(f"{path}: belongs to another configuration or other data: {changed}")
+    return checkpoint

@@ -1,0 +1,262 @@
+"""Configuration files: TOML whose schema is the domain's own dataclasses.
+
+Unknown keys, wrong types and unphysical values are errors that name the file, the key, the value and the law.
+"""
+
+import dataclasses
+import difflib
+import math
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import cattrs
+import tomli_w
+import torch
+from cattrs import transform_error
+from cattrs.errors import ForbiddenExtraKeysError
+from cattrs.gen import make_dict_structure_fn, override
+from torch import Tensor
+
+from recon.descend import Recipe
+from torchdic import STANDARD, Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+from torchdic.microscope import check_apertures
+
+T = TypeVar("T")
+BRIGHT_FIELD = "brightfield"
+
+
+class ConfigError(ValueError):
+    """A configuration that can't be used: one line with the file, the key, the value and the law."""
+
+
+@dataclass(frozen=True)
+class VolumeSection:
+    """The volume's grid: shape (z, y, x) in voxels, spacing (z, y, x) in µm, and the background's index."""
+
+    shape: tuple[int, int, int]
+    spacing: tuple[float, float, float]
+    background: float
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.background < math.inf):
+            raise ValueError(f"background {self.background} must be a refractive index of at least 1")
+        Grid(self.shape, self.spacing)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the volume."""
+        return Grid(self.shape, self.spacing)
+
+
+@dataclass(frozen=True)
+class DataSection:
+    """The measured stack, and how it is brought to the model's unit; see `recon.measured.prepare`."""
+
+    path: str
+    flatten: bool | None = None
+    scale: float | Literal["background"] | None = None
+    offset: float = 0.0
+    order: int = 2
+
+
+@dataclass(frozen=True)
+class ReconstructionSection(Recipe):
+    """How to descend, see `recon.descend.Recipe`, and how often to save.
+
+    checkpoint_every: steps between checkpoints.
+    """
+
+    checkpoint_every: int = 10
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.checkpoint_every < 1:
+            raise ValueError(f"checkpoint_every {self.checkpoint_every} must be at least 1 step")
+
+
+@dataclass(frozen=True)
+class SimulationSection:
+    """How to simulate. seed: of the camera's noise. exact: the specimen's exact field instead of a propagation."""
+
+    seed: int = 0
+    exact: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Config:
+    """All sections of a configuration file; `specimen` is left to `data_synthetic`, which knows its kinds."""
+
+    volume: VolumeSection
+    microscope: Microscope
+    acquisition: Acquisition
+    data: DataSection | None = None
+    fidelity: Fidelity = STANDARD
+    reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
+    simulation: SimulationSection = field(default_factory=SimulationSection)
+    specimen: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        check_apertures(self.microscope, self.volume.background)
+
+
+def load(path: str | os.PathLike[str]) -> Config:
+    """Read a configuration file; relative paths in it start from its folder. Raises ConfigError."""
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8")
+        values = tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not TOML: {error}") from error
+    config = structure(values, Config, str(path))
+    if config.data is not None:
+        data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
+        config = dataclasses.replace(config, data=data)
+    return config
+
+
+def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
+    """An instance of a dataclass from plain values. Raises ConfigError that names `source` and the key (below `where`)."""
+    try:
+        return converter.structure(values, kind)
+    except Exception as error:
+        problem = _first_problem(error, where)
+        if problem is None:
+            raise
+        raise ConfigError(f"{source}: {problem}") from error
+
+
+def dump(config: Config) -> str:
+    """The resolved configuration as TOML: every default spelled out, what is absent left out."""
+    return tomli_w.dumps(_plain(dataclasses.asdict(config)))
+
+
+def _first_problem(error: Exception, where: str) -> str | None:
+    """What is wrong, with its key: an unknown one before what it left missing. None for an error not about values."""
+    problems = []
+    for line in transform_error(error, path=where or "$", format_exception=_describe):
+        message, _, path = line.rpartition(" @ ")
+        key = path.removeprefix("$").removeprefix(".")
+        if message.startswith("unknown key "):
+            name = message.removeprefix("unknown key ")
+            problems.insert(0, f"unknown key {key}.{name}" if key else f"unknown key {name}")
+        elif message == "missing key":
+            problems.append(f"missing key {key}")
+        elif message:
+            problems.append(f"{key}: {message}" if key else message)
+    return problems[0] if problems else None
+
+
+def _describe(error: BaseException, _: type | None) -> str:
+    if isinstance(error, ForbiddenExtraKeysError):
+        name = min(error.extra_fields)
+        known = [f.name for f in dataclasses.fields(error.cl)]
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
+        return f"unknown key {name}; {hint}"
+    if isinstance(error, KeyError):
+        return "missing key"
+    return str(error)
+
+
+def _strict(kind: type, accepted: tuple[type, ...], words: str) -> Callable[[Any, Any], Any]:
+    def hook(value: Any, _: Any) -> Any:
+        if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+            raise TypeError(f"{value!r} must be {words}")
+        return kind(value)
+
+    return hook
+
+
+def _literal(value: Any, kind: Any) -> Any:
+    choices = get_args(kind)
+    if value not in choices:
+        raise ValueError(f"{value!r} must be one of {', '.join(map(repr, choices))}")
+    return value
+
+
+def _tuple(value: Any, kind: Any) -> tuple[Any, ...]:
+    kinds = get_args(kind)
+    if not isinstance(value, list | tuple) or len(value) != len(kinds):
+        raise ValueError(f"{value!r} must be an array of {len(kinds)} values")
+    return tuple(converter.structure(v, k) for v, k in zip(value, kinds, strict=True))
+
+
+def _prism(value: Any, _: Any) -> Prism | None:
+    if value == BRIGHT_FIELD:
+        return None
+    if not isinstance(value, dict):
+        raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
+    return _structure_prism(value, Prism)
+
+
+def _sequence_of(hook: Callable[[Any, Any], Any]) -> Callable[[Any, Any], tuple[Any, ...]]:
+    def structure_all(value: Any, _: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list | tuple):
+            raise TypeError(f"{value!r} must be an array")
+        return tuple(hook(v, None) for v in value)
+
+    return structure_all
+
+
+def _tensor(value: Any, _: Any) -> Tensor:
+    try:
+        return torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{value!r} must be an array of numbers") from error
+
+
+def _aberrations(value: Any, _: Any) -> dict[int, float]:
+    if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
+        raise TypeError(f"{value!r} must be a table of Noll indices, each with its phase in rad")
+    return {int(key): _number(coefficient, float) for key, coefficient in value.items()}
+
+
+def _scale(value: Any, _: Any) -> float | str:
+    return value if value == "background" else _number(value, float)
+
+
+def _plain(value: Any) -> Any:
+    """What TOML can hold: None left out of tables, tensors as arrays, a missing prism by its name."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [BRIGHT_FIELD if v is None else _plain(v) for v in value]
+    return value.tolist() if isinstance(value, Tensor) else value
+
+
+_number = _strict(float, (int, float), "a number")
+
+converter = cattrs.Converter(forbid_extra_keys=True)
+for _kind, _accepted, _words in (
+    (float, (int, float), "a number"),
+    (int, (int,), "a whole number"),
+    (str, (str,), "a string"),
+    (bool, (bool,), "true or false"),
+):
+    converter.register_structure_hook(_kind, _strict(_kind, _accepted, _words))
+converter.register_structure_hook_func(lambda kind: get_origin(kind) is Literal, _literal)
+converter.register_structure_hook_func(
+    lambda kind: get_origin(kind) is tuple and Ellipsis not in get_args(kind), _tuple
+)
+_structure_prism = make_dict_structure_fn(
+    Prism,
+    converter,
+    shear=override(struct_hook=lambda value, _: _tuple(value, tuple[float, float])),
+    bias=override(struct_hook=_number),
+)
+for _cls, _hooks in {
+    Objective: {"aberrations": _aberrations},
+    Condenser: {"points": _tensor, "weights": _tensor},
+    Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},
+    DataSection: {"scale": _scale},
+}.items():
+    converter.register_structure_hook(
+        _cls,
+        make_dict_structure_fn(_cls, converter, **{k: override(struct_hook=h) for k, h in _hooks.items()}),
+    )
