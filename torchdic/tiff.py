@@ -198,11 +198,14 @@ def _read(path: Path) -> Stack:
             sizes = _imagej_sizes(tif, path)
         series = _only_series(tif, path)
         page = series.keyframe
-        _check_grey(page, path)
+        if not _is_array_stored_as_colour(series):
+            _check_grey(page, path)
         if page.dtype is None or page.dtype.kind not in "iuf":
             raise StackError(f"{path}: pixels are {page.dtype}, a stack holds integers or floats")
         shape = tuple(series.get_shape(squeeze=False))
         axes = series.get_axes(squeeze=False)
+        if _is_array_stored_as_colour(series):
+            axes = axes.replace("S", "Q")
         if 0 in shape:
             raise StackError(f"{path}: is empty, {_by(shape)} along {axes}; a stack has at least one pixel")
         _check_pixels_present(tif, series, path)
@@ -238,11 +241,19 @@ def _only_series(tif: tifffile.TiffFile, path: Path) -> tifffile.TiffPageSeries:
 def _check_grey(page: tifffile.TiffPage, path: Path) -> None:
     if page.samplesperpixel > 1:
         raise StackError(
-            f"{path}: is a colour image, {page.samplesperpixel} samples per pixel; a stack is greyscale"
+            f"{path}: is a colour image, {page.samplesperpixel} samples per pixel; a stack is grey "
+            "(tifffile writes one with photometric='minisblack')"
         )
-    if page.photometric != _GREY:
+    if "PhotometricInterpretation" in page.tags and page.photometric != _GREY:
         kind = _PHOTOMETRIC.get(int(page.photometric), f"photometric interpretation {int(page.photometric)}")
         raise StackError(f"{path}: is not greyscale ({kind}); a stack's values grow with the light")
+
+
+def _is_array_stored_as_colour(series: tifffile.TiffPageSeries) -> bool:
+    """Whether tifffile stored floats (..., 3 or 4, y, x) as RGB planes, as it does if not told otherwise."""
+    page = series.keyframe
+    planar = page.planarconfig == tifffile.PLANARCONFIG.SEPARATE
+    return series.kind == "shaped" and planar and page.dtype is not None and page.dtype.kind == "f"
 
 
 def _arrange(data: np.ndarray, axes: str, path: Path) -> Shaped[np.ndarray, "prism focus y x"]:

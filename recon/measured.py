@@ -1,0 +1,309 @@
+"""A measured stack in the model's unit: checked against the acquisition, flattened and scaled."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Real
+
+from torchdic.tiff import Stack, StackError, StackWarning
+
+_TOLERANCE = 0.01  # relative difference between the file's sizes and the config's that passes without a word
+_SATURATED = 0.01  # fraction of saturated pixels that passes without a word
+_EXTINCT = 1e-3  # an emptier background than this is darkness: stray light and dark counts outweigh it
+_BRIGHT = 1.5  # no empty background exceeds 1, the empty bright field, by so much
+_BLOCKS = 64  # the background is smooth: its fit sees block means, at most this many along an axis
+_TUKEY = 4.685  # Tukey's biweight: 95 % efficient on Gaussian noise
+_NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
+
+
+@dataclass(frozen=True)
+class PrismReport:
+    """What was found in the images of one prism, and done to them.
+
+    bias: rad, None for bright field. background: mean level of the empty field in the file's unit,
+    offset removed. scale: the file's unit per empty bright field, by which the images were divided.
+    unevenness: peak to peak of the background that was flattened, relative to its mean (0 where nothing
+    was). noise: its standard deviation in units of the empty bright field, None for images too small to
+    tell.
+    """
+
+    bias: float | None
+    background: float
+    scale: float
+    unevenness: float
+    noise: float | None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A measured stack in the model's unit.
+
+    data: (prism, focus, y, x), float32, relative to the empty bright field. focus: µm.
+    pixel_size: (y, x) in µm. prisms: one report each.
+    """
+
+    data: Float[np.ndarray, "prism focus y x"]
+    focus: tuple[float, ...]
+    pixel_size: tuple[float, float]
+    prisms: tuple[PrismReport, ...]
+
+
+def prepare(
+    stack: Stack,
+    biases: Sequence[float | None],
+    focus: Sequence[float],
+    pixel_size: tuple[float, float] | None = None,
+    *,
+    pixels: tuple[int, int] | None = None,
+    flatten: bool | None = None,
+    scale: float | Literal["background"] | None = None,
+    offset: float = 0.0,
+    order: int = 2,
+) -> Measured:
+    """Check a stack against the acquisition and bring it to the model's unit, the empty bright field.
+
+    biases: one per prism, rad; None is bright field. focus: one per plane, µm. pixel_size: (y, x) in µm,
+    which wins over the file's; None takes the file's. pixels: (y, x) of the model, checked where given.
+    flatten: divide by the slow background, a polynomial surface of total degree `order`, one per prism; an
+    extinct prism's background (sin²(bias/2) below 1e-3) is stray light and is subtracted instead.
+    scale: the file's unit per empty bright field, or "background" for what takes the empty field to
+    sin²(bias/2), in bright field to 1. offset: the camera's dark counts in the file's unit, subtracted first.
+    By default integers are flattened and scaled by their background; floats count as relative to the empty
+    bright field and are left alone.
+    Raises StackError where prisms, planes or pixels are not as many as said, no pixel size is known, an
+    extinct background should set the scale, or the background to divide by is not above 0.
+    Warns StackWarning where the file's sizes differ by more than 1 %, more than 1 % of the pixels are
+    saturated, or floats look like counts.
+    """
+    focus = tuple(float(z) for z in focus)
+    _check_options(stack, scale, offset, order)
+    _check_counts(stack, len(biases), len(focus), pixels)
+    pixel_size = _agreed_pixel_size(stack, pixel_size)
+    _compare_focus(stack, focus)
+    _check_saturation(stack)
+    if flatten is None:
+        flatten = stack.is_integer
+    if scale is None:
+        scale = "background" if stack.is_integer else 1.0
+    prepared = [
+        _in_model_unit(images, bias, flatten, scale, offset, order, f"{stack.source}: prism {prism}")
+        for prism, (images, bias) in enumerate(zip(stack.data, biases, strict=True))
+    ]
+    reports = tuple(report for _, report in prepared)
+    if not stack.is_integer:
+        _check_brightness(stack, reports)
+    return Measured(np.stack([images for images, _ in prepared]), focus, pixel_size, reports)
+
+
+def _in_model_unit(
+    images: Real[np.ndarray, "focus y x"],
+    bias: float | None,
+    flatten: bool,
+    scale: float | Literal["background"],
+    offset: float,
+    order: int,
+    label: str,
+) -> tuple[Float[np.ndarray, "focus y x"], PrismReport]:
+    """One prism's images relative to the empty bright field, float32."""
+    expected = _empty_field(bias)
+    extinct = expected < _EXTINCT
+    if scale == "background" and extinct:
+        raise StackError(
+            f"{label} has bias {bias:g} rad: its empty background {expected:.2g} is below {_EXTINCT:g}, "
+            "too dark to scale by; give scale, the counts per empty bright field"
+        )
+    # the lamp is steady while the specimen moves through focus: one surface serves all planes
+    surface = background_surface(np.median(images, axis=0) - offset, order if flatten else 0)
+    level, lowest = float(surface.mean()), float(surface.min())
+    if lowest <= 0 and (scale == "background" or (flatten and not extinct)):
+        raise StackError(
+            f"{label}'s background less the offset {offset:g} falls to {lowest:.4g}; "
+            "it must stay above 0 to divide by"
+        )
+    unit = level / expected if scale == "background" else float(scale)
+    scaled = np.empty(images.shape, np.float32)
+    for plane, image in enumerate(images):
+        light = image.astype(np.float64) - offset
+        if flatten:
+            light = light - surface if extinct else light * (level / surface)
+        scaled[plane] = light / unit
+    noise = noise_level(images)
+    report = PrismReport(
+        bias=bias,
+        background=level,
+        scale=unit,
+        unevenness=float(np.ptp(surface)) / abs(level) if flatten and level else 0.0,
+        noise=None if noise is None else noise / unit,
+    )
+    return scaled, report
+
+
+def _empty_field(bias: float | None) -> float:
+    """The intensity of an empty image, relative to the empty bright field."""
+    return 1.0 if bias is None else math.sin(bias / 2) ** 2
+
+
+def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[np.ndarray, "y x"]:
+    """The slow background of an image (y, x), in its unit: a polynomial surface of total degree `order`.
+
+    Fitted to block means by least absolute deviations, then by least squares with Tukey's biweight, each
+    reweighted until it stands still: a specimen that stands out of the noise and leaves most of the field
+    empty loses its say. Returns float64 of the image's shape.
+    """
+    ny, nx = image.shape
+    by, bx = math.ceil(ny / _BLOCKS), math.ceil(nx / _BLOCKS)
+    ky, kx = ny // by, nx // bx
+    blocks = image[: ky * by, : kx * bx].astype(np.float64).reshape(ky, by, kx, bx)
+    values = blocks.mean(axis=(1, 3)).ravel()
+    middle = float(np.median(values))  # keeps digits where a bright background is nearly flat
+    values -= middle
+    rows, columns = (np.arange(ky) + 0.5) * by - 0.5, (np.arange(kx) + 0.5) * bx - 0.5
+    basis = _polynomials(rows, columns, (ny, nx), order)
+    basis = basis.reshape(len(basis), -1).T
+    rounding = 100 * np.finfo(np.float64).eps * max(abs(middle), float(np.abs(values).max()))
+    coefficients = _weighted_fit(basis, values, np.ones_like(values))
+    # biweights alone would keep what plain least squares has bent to; absolute deviations bend less
+    for weight in (_absolute, _biweight):
+        for _ in range(100):
+            residual = np.abs(values - basis @ coefficients)
+            typical = float(np.median(residual))
+            if typical <= rounding:
+                break  # more than half of the image lies on the surface
+            previous = coefficients
+            coefficients = _weighted_fit(basis, values, weight(residual / typical))
+            if np.abs(coefficients - previous).max() < 1e-4 * typical:
+                break
+    surface = _polynomials(np.arange(ny), np.arange(nx), (ny, nx), order)
+    return middle + np.tensordot(coefficients, surface, axes=1)
+
+
+def _weighted_fit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Coefficients of weighted least squares, from the Gram matrix: Legendre's is near diagonal."""
+    weighted = basis * weight[:, None]
+    return np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
+
+
+def _absolute(residual: np.ndarray) -> np.ndarray:
+    """Weights of least absolute deviations; residuals are relative to their median."""
+    return 1 / np.maximum(residual, 1e-3)
+
+
+def _biweight(residual: np.ndarray) -> np.ndarray:
+    """Tukey's weights; residuals are relative to their median."""
+    return np.clip(1 - (residual * (_NORMAL_MAD / _TUKEY)) ** 2, 0, None) ** 2
+
+
+def noise_level(images: Real[np.ndarray, "*planes y x"]) -> float | None:
+    """The standard deviation of the noise in images (..., y, x), in their unit; None below 3 × 3 pixels.
+
+    From the median magnitude under a mask that is blind to anything smooth (Immerkær, Computer Vision
+    and Image Understanding 64, 300, 1996; his mean is a median here, for the sake of edges).
+    """
+    if min(images.shape[-2:]) < 3:
+        return None
+    along_x = np.diff(images.astype(np.float64), n=2, axis=-1)
+    masked = np.diff(along_x, n=2, axis=-2)  # [1 −2 1]ᵀ[1 −2 1], whose squares sum to 36
+    return float(np.median(np.abs(masked))) / (6 * _NORMAL_MAD)
+
+
+def _polynomials(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], order: int) -> np.ndarray:
+    """Products of Legendre polynomials of total degree up to `order` at pixel indices: (term, y, x)."""
+    ny, nx = shape
+    along_y = np.polynomial.legendre.legvander(2 * (rows + 0.5) / ny - 1, order)
+    along_x = np.polynomial.legendre.legvander(2 * (columns + 0.5) / nx - 1, order)
+    terms = [(i, j) for i in range(order + 1) for j in range(order + 1 - i)]
+    return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in terms])
+
+
+def _check_options(stack: Stack, scale: float | str | None, offset: float, order: int) -> None:
+    if isinstance(scale, str) and scale != "background":
+        raise StackError(f"{stack.source}: scale {scale!r} must be a number above 0 or 'background'")
+    if scale is not None and not isinstance(scale, str) and not (math.isfinite(scale) and scale > 0):
+        raise StackError(f"{stack.source}: scale {scale} must be above 0")
+    if not math.isfinite(offset):
+        raise StackError(f"{stack.source}: offset {offset} must be finite")
+    if order < 0:
+        raise StackError(f"{stack.source}: background order {order} must be at least 0")
+
+
+def _check_counts(stack: Stack, prisms: int, planes: int, pixels: tuple[int, int] | None) -> None:
+    held = stack.data.shape
+    if held[:2] != (prisms, planes):
+        raise StackError(
+            f"{stack.source} holds {_counted(held[0], 'prism')} × {_counted(held[1], 'plane')}, "
+            f"the acquisition says {prisms} × {planes}"
+        )
+    if pixels is not None and held[2:] != tuple(pixels):
+        raise StackError(
+            f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), the volume {pixels[0]} × {pixels[1]}"
+        )
+
+
+def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tuple[float, float]:
+    found = stack.pixel_size
+    if wanted is None:
+        if found is None:
+            raise StackError(f"{stack.source}: neither the file nor the config gives a pixel size")
+        return found
+    if found is not None and any(_differ(a, b) for a, b in zip(found, wanted, strict=True)):
+        warnings.warn(
+            f"{stack.source}: its pixels are {found[0]:.4g} × {found[1]:.4g} µm (y × x), the config's "
+            f"{wanted[0]:.4g} × {wanted[1]:.4g} µm; the config's are used",
+            StackWarning,
+            stacklevel=3,
+        )
+    return float(wanted[0]), float(wanted[1])
+
+
+def _compare_focus(stack: Stack, focus: tuple[float, ...]) -> None:
+    found = stack.focus_step
+    steps = [abs(b - a) for a, b in pairwise(focus)]
+    if found is None or not any(_differ(found, step) for step in steps):
+        return
+    low, high = min(steps), max(steps)
+    said = f"{low:.4g} to {high:.4g}" if _differ(low, high) else f"{low:.4g}"
+    warnings.warn(
+        f"{stack.source}: its focus step is {found:.4g} µm, the config's {said} µm; the config's is used",
+        StackWarning,
+        stacklevel=3,
+    )
+
+
+def _check_saturation(stack: Stack) -> None:
+    limit = stack.saturation
+    if limit is None:
+        return
+    count = int((stack.data >= limit).sum())
+    if count > _SATURATED * stack.data.size:
+        warnings.warn(
+            f"{stack.source}: {count} of {stack.data.size} pixels ({count / stack.data.size:.1%}) are "
+            f"saturated at {limit}; their intensity is unknown",
+            StackWarning,
+            stacklevel=3,
+        )
+
+
+def _check_brightness(stack: Stack, reports: Sequence[PrismReport]) -> None:
+    for prism, report in enumerate(reports):
+        found = report.background / report.scale
+        if found > _BRIGHT:
+            expected = _empty_field(report.bias)
+            warnings.warn(
+                f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g}: "
+                "float pixels count as relative to the empty bright field unless a scale is given",
+                StackWarning,
+                stacklevel=3,
+            )
+
+
+def _differ(found: float, wanted: float) -> bool:
+    return abs(found - wanted) > _TOLERANCE * abs(wanted)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
