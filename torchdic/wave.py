@@ -76,7 +76,7 @@ def split_step(
         if kappas is not None:
             kappa = slab_mean(kappas, step, steps)
             path = torch.complex(path - kappa**2, 2 * n * kappa)
-        return k0 * dz * path / (axial_momentum(n, momentum[:, None, None, :]) + pz0)
+        return k0 * dz * path / ((pz0.square() + path).sqrt() + pz0)
 
     def first_order(phi: Tensor, S: Tensor) -> Tensor:
         V = S * H
