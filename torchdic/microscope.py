@@ -79,8 +79,9 @@ class Acquisition:
                 "an acquisition needs at least one prism (or None for bright field) and one focus plane"
             )
         for focus in self.focus:
-            if not math.isfinite(float(focus)):
-                raise ValueError(f"focus {float(focus)} must be a finite depth in µm")
+            depth = float(torch.as_tensor(focus).detach())
+            if not math.isfinite(depth):
+                raise ValueError(f"focus {depth} must be a finite depth in µm")
         object.__setattr__(self, "prisms", tuple(self.prisms))
         object.__setattr__(self, "focus", tuple(self.focus))
 
@@ -93,7 +94,7 @@ def image(
     Pixels are the volume's (y, x) voxel centres. Raises ValueError where an aperture exceeds the medium's index; warns
     with SamplingWarning where the voxels are coarser than the light.
     """
-    check_apertures(microscope, float(volume.background))
+    check_apertures(microscope, float(volume.background.detach()))
     _check_sampling(microscope, volume.grid)
     pad = fidelity.padding
     volume = _padded(volume, pad)
@@ -140,7 +141,7 @@ def image_field(
     the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
     the medium. Raises ValueError as `image` does, and where a shape is not the grid's.
     """
-    check_apertures(microscope, float(background))
+    check_apertures(microscope, float(torch.as_tensor(background).detach()))
     _check_sampling(microscope, grid)
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))
@@ -213,7 +214,7 @@ def check_apertures(microscope: Microscope, background: float) -> None:
         if part is not None and part.na > background:
             raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
     if condenser is not None:
-        largest = condenser.na if condenser.points is None else float(condenser.points.norm(dim=-1).max())
+        largest = condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
         if largest >= background:
             raise ValueError(
                 f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"

@@ -27,8 +27,9 @@ class Objective:
         for index, value in (self.aberrations or {}).items():
             if isinstance(index, bool) or not isinstance(index, int) or index < 1:
                 raise ValueError(f"aberration {index!r}: a Noll index is a whole number from 1")
-            if not math.isfinite(float(value)):
-                raise ValueError(f"aberration {index}: {float(value)} rad must be a finite number")
+            coefficient = float(torch.as_tensor(value).detach())
+            if not math.isfinite(coefficient):
+                raise ValueError(f"aberration {index}: {coefficient} rad must be a finite number")
 
     def aperture(self, momentum: Float[Tensor, "source 2 y x"]) -> Tensor:
         """Which transverse momenta n·sinθ the pupil lets through, shape (source, y, x); its edge counts as inside."""

@@ -24,8 +24,9 @@ class Prism:
         if len(self.shear) != 2:
             raise ValueError(f"shear has {len(self.shear)} components: it must be (y, x) in µm")
         for name, value in (("shear y", self.shear[0]), ("shear x", self.shear[1]), ("bias", self.bias)):
-            if not math.isfinite(float(value)):
-                raise ValueError(f"{name} {float(value)} must be a finite number")
+            number = float(torch.as_tensor(value).detach())
+            if not math.isfinite(number):
+                raise ValueError(f"{name} {number} must be a finite number")
 
     def transfer(self, frequencies: Float[Tensor, "2 y x"]) -> Float[Tensor, "y x"]:
         """sin(π f·s + bias/2): the two beams' interference behind a crossed analyser, but for a constant factor i.
