@@ -1,1 +1,219 @@
-def main() -> int: ...
+"""The command line: torchdic demo | simulate | reconstruct."""
+
+import argparse
+import math
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+
+from data_synthetic import Bead, CellPhantom, EtchedGlassStep, GaussianBall, GradedIndexRod, LayeredMedium
+from recon import figures
+from recon.checkpoint import CheckpointError
+from recon.compare import compare, table
+from recon.config import Config, ConfigError, load, structure
+from recon.descend import Recipe
+from recon.reconstruct import Interrupted, prepare_folder, reconstruct
+from recon.simulate import exact_images
+from torchdic import (
+    Acquisition,
+    Condenser,
+    Fidelity,
+    Grid,
+    Microscope,
+    Objective,
+    Prism,
+    SamplingWarning,
+    Volume,
+    image,
+)
+from torchdic.tiff import StackError, write_stack
+
+SPECIMENS: dict[str, type] = {
+    "bead": Bead,
+    "cell": CellPhantom,
+    "etched_glass": EtchedGlassStep,
+    "gaussian_ball": GaussianBall,
+    "graded_index_rod": GradedIndexRod,
+    "layered_medium": LayeredMedium,
+}
+BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, or 2 for bad input, 130 for an interruption."""
+    options = _parser().parse_args(arguments)
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("once", SamplingWarning)
+    try:
+        options.command(options)
+    except (ConfigError, StackError, CheckpointError) as error:
+        return _fail(str(error), BAD_INPUT)
+    except FloatingPointError as error:
+        return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
+    except (Interrupted, KeyboardInterrupt) as error:
+        return _fail(str(error) or "interrupted", INTERRUPTED)
+    return 0
+
+
+def _demo(options: argparse.Namespace) -> None:
+    prepare_folder(options.out)
+    bead = Bead(radius=2.5, contrast=0.03, background=1.56)
+    grid = Grid((20, 64, 64), (0.4, 0.17, 0.17))
+    microscope = Microscope(0.546, Objective(0.9), Condenser(0.7))
+    prisms = [
+        Prism(shear, bias) for shear in ((0.0, 0.24), (0.24, 0.0)) for bias in (math.pi / 2, -math.pi / 2)
+    ]
+    acquisition = Acquisition(prisms, [float(z) for z in range(-4, 5)])
+    print("A 5 µm bead of index 1.59 in cement of 1.56: DIC stack from its exact field …", flush=True)
+    data = exact_images(bead, grid, microscope, acquisition, Fidelity(sources=150)).float()
+    write_stack(options.out / "stack.ome.tif", data, grid.spacing[1:], 1.0)
+    figures.save(
+        figures.draw_stack(data, prisms, acquisition.focus, grid.spacing[1:]), options.out / "stack.png"
+    )
+    truth = bead.delta(grid, dtype=torch.float32)
+    contenders = [
+        (Fidelity("projection"), Recipe(steps=60)),
+        (Fidelity("rays", sources=16, steps=10), Recipe(steps=40)),
+        (Fidelity("wave", order=1), Recipe(steps=120)),
+    ]
+    trials = compare(
+        data,
+        truth,
+        truth > 0.99 * bead.contrast,
+        grid,
+        bead.background,
+        microscope,
+        acquisition,
+        contenders,
+        options.out,
+    )
+    print("\n" + table(trials, bead.contrast))
+    print(f"\nmean Δn: over the voxels wholly inside the bead. Pictures and volumes are in {options.out}/")
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    config = load(options.config)
+    specimen = _specimen(config, str(options.config))
+    grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
+    if specimen.background != config.volume.background:
+        raise ConfigError(
+            f"{options.config}: specimen.background {specimen.background} differs from volume.background "
+            f"{config.volume.background}"
+        )
+    if config.simulation.exact and not hasattr(specimen, "field"):
+        raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
+    prepare_folder(options.out)
+    if config.simulation.exact:
+        images = exact_images(specimen, grid, microscope, acquisition, config.fidelity)
+    else:
+        with torch.no_grad():
+            delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
+            images = image(
+                Volume(grid, delta, specimen.background), microscope, acquisition, config.fidelity
+            ).cpu()
+    if microscope.camera is not None:
+        images = microscope.camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
+    focus = [float(f) for f in acquisition.focus]
+    write_stack(options.out / "stack.ome.tif", images.float(), grid.spacing[1:], _equal_step(focus))
+    figures.save(
+        figures.draw_stack(images, acquisition.prisms, focus, grid.spacing[1:]), options.out / "stack.png"
+    )
+    print(f"{options.out / 'stack.ome.tif'}: {_counts(images.shape)}")
+
+
+def _reconstruct(options: argparse.Namespace) -> None:
+    signal.signal(signal.SIGTERM, _interrupt)
+    config = load(options.config)
+    result = reconstruct(config, options.out, options.device, resume=options.resume, restart=options.restart)
+    delta: Any = result.metrics["delta"]
+    print(
+        f"{options.out / 'volume.ome.tif'}: Δn {delta['min']:.4g} … {delta['max']:.4g}, "
+        f"misfit {result.metrics['misfit']:.4g} after {result.metrics['steps']} steps"
+    )
+
+
+def _specimen(config: Config, source: str) -> Any:
+    if config.specimen is None:
+        raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
+    values = dict(config.specimen)
+    kind = values.pop("kind", None)
+    if kind not in SPECIMENS:
+        raise ConfigError(
+            f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}"
+        )
+    values.setdefault("background", config.volume.background)
+    return structure(values, SPECIMENS[kind], source, "specimen")
+
+
+def _equal_step(focus: Sequence[float]) -> float | None:
+    """The distance between focus planes, None where they are not equally spaced upwards."""
+    steps = [b - a for a, b in zip(focus[:-1], focus[1:], strict=True)]
+    if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
+        return None
+    return steps[0]
+
+
+def _counts(shape: Sequence[int]) -> str:
+    return f"{shape[0]} prism settings × {shape[1]} focus planes × {shape[2]} × {shape[3]} pixels"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="torchdic",
+        description="Simulate DIC images, and reconstruct the refractive-index volume behind them.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    out = argparse.ArgumentParser(add_help=False)
+    out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    device = argparse.ArgumentParser(add_help=False)
+    device.add_argument(
+        "--device", type=_device, default="auto", help="cpu, cuda, … (default: a GPU where there is one)"
+    )
+    config = argparse.ArgumentParser(add_help=False)
+    config.add_argument("config", type=Path, metavar="CONFIG.toml")
+
+    demo = commands.add_parser("demo", parents=[out], help="a bead: truth beside three reconstructions")
+    demo.set_defaults(command=_demo)
+    simulate = commands.add_parser("simulate", parents=[config, out, device], help="DIC stack of a specimen")
+    simulate.set_defaults(command=_simulate)
+    fit = commands.add_parser(
+        "reconstruct", parents=[config, out, device], help="index volume behind a DIC stack"
+    )
+    again = fit.add_mutually_exclusive_group()
+    again.add_argument(
+        "--resume", action="store_true", help="go on with an interrupted run in DIR, if there is one"
+    )
+    again.add_argument(
+        "--restart", action="store_true", help="begin anew in spite of an interrupted run in DIR"
+    )
+    fit.set_defaults(command=_reconstruct)
+    return parser
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.zeros(1, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        raise argparse.ArgumentTypeError(
+            f"{name!r} is no device here: {str(error).splitlines()[0]}"
+        ) from error
+
+
+def _interrupt(_number: int, _frame: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    print(f"torchdic: warning: {message}", file=sys.stderr)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"torchdic: error: {message}", file=sys.stderr)
+    return code

@@ -22,7 +22,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.descend import Recipe
-from torchdic import STANDARD, Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+from torchdic import STANDARD, Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 from torchdic.microscope import check_apertures
 
 T = TypeVar("T")

@@ -1,5 +1,6 @@
 """Adam's descent from a start to the volume that explains the data, as a generator of steps."""
 
+import copy
 import math
 import time
 from collections.abc import Iterator
@@ -17,6 +18,9 @@ from recon.regularisers import magnitude, total_variation
 from recon.schedule import cosine, held_then_annealed
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
 
+# Distance in Δn from its bounds that every voxel starts with.
+MARGIN = 1e-3
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -30,8 +34,8 @@ class Recipe:
 
     steps: int = 150
     learning_rate: float = 5e-3
-    tv: tuple[float, float] = (100.0, 30.0)
-    l1: float = 2.0
+    tv: tuple[float, float] = (100.0, 10.0)
+    l1: float = 1.0
     bounds: Bounds = field(default_factory=Bounds)
     start: Literal["linear", "zero"] = "linear"
     draft_sources: int | None = 24
@@ -52,7 +56,7 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a descent, and all that is needed to go on from it.
+    """One step of a descent, and all that is needed to go on from it: nothing in it changes any more.
 
     number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it. seconds: that
     the descent has taken, its start included. parameter, optimiser: the learned tensor and Adam's state.
@@ -84,7 +88,9 @@ def descend(
     """
     expected = (len(acquisition.prisms), len(acquisition.focus), *grid.shape[1:])
     if tuple(data.shape) != expected:
-        raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}")
+        raise ValueError(
+            f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}"
+        )
     started = time.perf_counter()
     variance = spatial_variance(data)
     if resume is None:
@@ -115,7 +121,9 @@ def descend(
         loss.backward()
         adam.step()
         if not math.isfinite(float(loss)) or not bool(torch.isfinite(parameter).all()):
-            raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {float(loss):g}")
+            raise FloatingPointError(
+                f"the descent diverged at step {number + 1}: the loss is {float(loss):g}"
+            )
         with torch.no_grad():
             delta = recipe.bounds.delta(parameter)
         yield Step(
@@ -124,23 +132,24 @@ def descend(
             float(loss),
             delta,
             seconds + time.perf_counter() - started,
-            parameter.detach(),
-            adam.state_dict(),
+            parameter.detach().clone(),
+            copy.deepcopy(adam.state_dict()),
         )
 
 
 def _start(
-    data: Tensor, grid: Grid, background: float, microscope: Microscope, acquisition: Acquisition, recipe: Recipe
+    data: Tensor,
+    grid: Grid,
+    background: float,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    recipe: Recipe,
 ) -> Tensor:
     if recipe.start == "linear":
         delta = linear_start(data, grid, background, microscope, acquisition)
     else:
         delta = data.new_zeros(grid.shape)
     return recipe.bounds.parameter(delta, margin=MARGIN)
-
-
-# Distance in Δn from its bounds that every voxel starts with.
-MARGIN = 1e-3
 
 
 def _draft(fidelity: Fidelity, recipe: Recipe, number: int) -> Fidelity:

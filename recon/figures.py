@@ -57,36 +57,34 @@ def draw_images(
 
 
 def draw_sections(
-    volumes: Mapping[str, Float[Tensor, "z y x"]], grid: Grid, *, planes: str = "xy xz yz"
+    volumes: Mapping[str, Float[Tensor, "z y x"]], grid: Grid, planes: Sequence[str] = ("xy", "xz", "yz")
 ) -> Figure:
-    """Sections through the first volume's centre of |Δn|, a row for each volume, all in one scale of Δn."""
-    names = planes.split()
+    """Sections through the first volume's centre of |Δn|: a column for each volume, a row for each plane, one scale."""
     through = _centre(next(iter(volumes.values())))
     top = max(float(v.max()) for v in volumes.values())
     bottom = min(0.0, *(float(v.min()) for v in volumes.values()))
-    z, y, x = grid.extent
-    sizes = {"xy": (y, x), "xz": (z, x), "yz": (z, y)}
-    widths = [sizes[n][1] for n in names]
-    height = max(sizes[n][0] for n in names)
+    size = dict(zip("zyx", grid.extent, strict=True))
+    heights = [size[name[1]] for name in planes]
+    widest = max(size[name[0]] for name in planes)
     figure = Figure(
-        figsize=(1.3 + 2.6 * sum(widths) / max(widths), 0.4 + 2.6 * height / max(widths) * len(volumes)),
+        figsize=(2.4 * len(volumes) + 1.2, 2.4 * sum(heights) / widest + 0.35 * len(planes) + 0.2),
         layout="constrained",
     )
-    axes = figure.subplots(len(volumes), len(names), squeeze=False, width_ratios=widths)
+    axes = figure.subplots(len(planes), len(volumes), squeeze=False, height_ratios=heights)
     shown = None
-    for row, (title, volume) in zip(axes, volumes.items(), strict=True):
-        for ax, name in zip(row, names, strict=True):
+    for column, (title, volume) in zip(axes.T, volumes.items(), strict=True):
+        for ax, name in zip(column, planes, strict=True):
             section = {"xy": volume[through[0]], "xz": volume[:, through[1]], "yz": volume[:, :, through[2]]}[
                 name
             ]
-            spacing = tuple(d for d, letter in zip(grid.spacing, "zyx", strict=True) if letter in name)
+            spacing = [grid.spacing["zyx".index(letter)] for letter in (name[1], name[0])]
             shown = _show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
             ax.set_ylabel(name[1], fontsize=8, labelpad=1)
-            _scale_bar(ax, sizes[name][1], "white")
-        row[0].set_title(title, fontsize=9, loc="left")
+            _scale_bar(ax, size[name[0]], "white")
+        column[0].set_title(title, fontsize=9)
     assert shown is not None
-    figure.colorbar(shown, ax=axes, label="Δn", shrink=0.8)
+    figure.colorbar(shown, ax=axes, label="Δn")
     return figure
 
 

@@ -1,7 +1,5 @@
 """Where a reconstruction begins: the weak specimen that explains the data linearly."""
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -1,6 +1,5 @@
 """How far the model's images are from the measured ones."""
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,7 +13,9 @@ def spatial_variance(data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, " 
     variance = data.var(dim=(2, 3), correction=0).mean(1)
     for prism, value in enumerate(variance.tolist()):
         if not value > 0:
-            raise ValueError(f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit")
+            raise ValueError(
+                f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit"
+            )
     return variance
 
 

@@ -445,7 +445,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path, mon
     before = path.read_bytes()
 
     def breaks_off(file, *args, **kwargs):
-        file.write(b"half of a")
+        file.write_bytes(b"half of a")
         raise error
 
     monkeypatch.setattr(tifffile, "imwrite", breaks_off)

@@ -37,7 +37,9 @@ class Condenser:
         if self.weights is not None:
             weights = torch.as_tensor(self.weights)
             if tuple(weights.shape) != (len(points),):
-                raise ValueError(f"condenser has {len(points)} points and weights of shape {tuple(weights.shape)}")
+                raise ValueError(
+                    f"condenser has {len(points)} points and weights of shape {tuple(weights.shape)}"
+                )
             if not (bool((weights >= 0).all()) and 0 < float(weights.sum()) < float("inf")):
                 raise ValueError("condenser weights must be at least 0, with a positive finite sum")
             object.__setattr__(self, "weights", weights)

@@ -19,8 +19,9 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     partial = Path(name)
     try:
         yield partial
-        mode = 0o666 & ~_umask()
-        partial.chmod(mode)
+        partial.chmod(0o666 & ~_umask())  # mkstemp's files are for their owner alone
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

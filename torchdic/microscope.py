@@ -214,7 +214,9 @@ def check_apertures(microscope: Microscope, background: float) -> None:
         if part is not None and part.na > background:
             raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
     if condenser is not None:
-        largest = condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
+        largest = (
+            condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
+        )
         if largest >= background:
             raise ValueError(
                 f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"

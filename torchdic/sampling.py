@@ -61,7 +61,10 @@ class SliceSampler:
         return _sample_linear(self._blend(z)[None], self._index(position))[0]
 
     def _index(self, position: Tensor) -> Tensor:
-        return torch.stack([position[..., a] / self.grid.spacing[a + 1] + (self.grid.shape[a + 1] - 1) / 2 for a in (0, 1)], -1)
+        return torch.stack(
+            [position[..., a] / self.grid.spacing[a + 1] + (self.grid.shape[a + 1] - 1) / 2 for a in (0, 1)],
+            -1,
+        )
 
     def _blend(self, z: float) -> Float[Tensor, "y x"]:
         weights = depth_weights(self.grid, z, self.interpolation)

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal, NoReturn
-from uuid import uuid4
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,6 +18,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from torchdic.files import written_whole
 from torchdic.grid import Grid
 
 # OME's units (schema 2016-06) and the spellings of ImageJ and its plugins; µ has two code points
@@ -460,25 +460,17 @@ def _write_ome(
     resolution = {}
     if sizes[1] is not None and sizes[2] is not None:  # for readers without OME, plain ImageJ among them
         resolution = {"resolution": (1e4 / sizes[2], 1e4 / sizes[1]), "resolutionunit": "CENTIMETER"}
-    partial = path.with_name(f".{path.name}.{uuid4().hex}.partial")
     try:
-        try:
-            with partial.open("xb") as file, _tifffile_logs_as_debug():
-                tifffile.imwrite(
-                    file,
-                    array,
-                    ome=True,
-                    photometric="minisblack",
-                    metadata=metadata,
-                    compression=compression,
-                    **resolution,
-                )
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:  # Ctrl-C too
-            partial.unlink(missing_ok=True)
-            raise
+        with written_whole(path) as partial, _tifffile_logs_as_debug():
+            tifffile.imwrite(
+                partial,
+                array,
+                ome=True,
+                photometric="minisblack",
+                metadata=metadata,
+                compression=compression,
+                **resolution,
+            )
     except OSError as error:
         raise StackError(f"{path}: cannot be written: {error.strerror or error}") from error
 

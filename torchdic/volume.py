@@ -33,12 +33,15 @@ class Volume(nn.Module):
         if absorption is not None:
             _check_field("absorption", absorption, grid)
             if bool((absorption < 0).any()):
-                raise ValueError(f"absorption {float(absorption.min()):g} is negative: κ must be at least 0")
-        index = float(background)
+                raise ValueError(
+                    f"absorption {float(absorption.detach().min()):g} is negative: κ must be at least 0"
+                )
+        index = float(torch.as_tensor(background).detach())
         if not (index > 0 and index < float("inf")):
             raise ValueError(f"background {index} must be a refractive index above 0")
-        if index + float(delta.min()) <= 0:
-            raise ValueError(f"index {index + float(delta.min()):g} = background {index:g} + delta must stay above 0")
+        lowest = index + float(delta.detach().min())
+        if lowest <= 0:
+            raise ValueError(f"index {lowest:g} = background {index:g} + delta must stay above 0")
         self.grid = grid
         self._keep("delta", delta)
         self._keep("background", torch.as_tensor(background).to(delta))

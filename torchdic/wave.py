@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.recompute import recompute, slabs
 from torchdic.rays import axial_momentum
+from torchdic.recompute import recompute, slabs
 from torchdic.volume import Volume
 
 
@@ -62,7 +62,11 @@ def split_step(
     """
     steps = fidelity.steps or volume.grid.shape[0]
     dz = volume.grid.extent[0] / steps
-    k0, n0, pz0 = 2 * math.pi / wavelength, volume.background, axial_momentum(volume.background, momentum)[:, None, None]
+    k0, n0, pz0 = (
+        2 * math.pi / wavelength,
+        volume.background,
+        axial_momentum(volume.background, momentum)[:, None, None],
+    )
     deltas = volume.delta.unbind(0)
     kappas = None if volume.absorption is None else volume.absorption.unbind(0)
 

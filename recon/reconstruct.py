@@ -1,0 +1,185 @@
+"""A reconstruction from a configuration to a folder of results, which may be interrupted and resumed."""
+
+import csv
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from tqdm import tqdm
+
+from recon import checkpoint, figures
+from recon.checkpoint import Checkpoint, CheckpointError, Row
+from recon.config import Config, ConfigError, dump
+from recon.descend import Step, descend
+from recon.measured import Measured, prepare
+from recon.metrics import residual_rms
+from recon.misfit import gaussian, spatial_variance
+from torchdic import Volume, image
+from torchdic.files import written_whole
+from torchdic.tiff import StackError, read_stack, write_volume
+
+CHECKPOINT = "checkpoint.pt"
+
+
+class Interrupted(Exception):
+    """The user stopped a descent; its message says how to go on."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a reconstruction leaves: Δn (z, y, x) and its metrics, as in metrics.json."""
+
+    delta: Float[Tensor, "z y x"]
+    metrics: dict[str, object]
+
+
+def load_data(config: Config) -> Measured:
+    """The configuration's measured stack in the model's unit. Raises ConfigError or StackError."""
+    if config.data is None:
+        raise ConfigError("missing key data.path: a reconstruction needs a stack")
+    section = config.data
+    measured = prepare(
+        read_stack(section.path),
+        [None if prism is None else float(prism.bias) for prism in config.acquisition.prisms],
+        [float(focus) for focus in config.acquisition.focus],
+        config.volume.spacing[1:],
+        pixels=config.volume.shape[1:],
+        flatten=section.flatten,
+        scale=section.scale,
+        offset=section.offset,
+        order=section.order,
+    )
+    try:
+        spatial_variance(torch.from_numpy(measured.data))
+    except ValueError as error:
+        raise StackError(f"{section.path}: {error}") from error
+    return measured
+
+
+def reconstruct(
+    config: Config, out: Path, device: torch.device, *, resume: bool = False, restart: bool = False
+) -> Result:
+    """Fit a volume to the configuration's stack and leave it in `out`, with metrics, log, configuration and figures.
+
+    resume: go on from the checkpoint in `out`, if there is one. restart: begin anew in spite of one.
+    Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; Interrupted on Ctrl-C,
+    with a checkpoint saved.
+    """
+    measured = load_data(config)
+    data = torch.from_numpy(measured.data).to(device)
+    identity = dump(config) + f"data sha256 {hashlib.sha256(measured.data.tobytes()).hexdigest()}\n"
+    saved = out / CHECKPOINT
+    start: Checkpoint | None = None
+    if saved.exists():
+        if resume:
+            start = checkpoint.load(saved, identity)
+        elif not restart:
+            raise CheckpointError(
+                f"{saved}: an interrupted run; go on with --resume or begin anew with --restart"
+            )
+    prepare_folder(out)
+    _write_text(out / "config.toml", dump(config))
+
+    last, rows = _descend(config, data, out, identity, start)
+    grid = config.volume.grid
+    with torch.no_grad():
+        volume = Volume(grid, last.delta, config.volume.background)
+        modelled = image(volume, config.microscope, config.acquisition, config.fidelity).cpu()
+    data, delta = data.cpu(), last.delta.cpu()
+    metrics = _metrics(config, measured, modelled, data, delta, last)
+    write_volume(out / "volume.ome.tif", delta, grid)
+    _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    prisms, focus = config.acquisition.prisms, measured.focus
+    figures.save(figures.draw_images(data, modelled, prisms, focus, grid), out / "images.png")
+    figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
+    figures.save(figures.draw_misfit(rows), out / "misfit.png")
+    saved.unlink(missing_ok=True)
+    return Result(delta, metrics)
+
+
+def prepare_folder(out: Path) -> None:
+    """Make sure that `out` is a folder that can be written to. Raises ConfigError."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with written_whole(out / ".writable"):
+            pass
+        (out / ".writable").unlink()
+    except OSError as error:
+        raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
+
+
+def _descend(
+    config: Config, data: Tensor, out: Path, identity: str, start: Checkpoint | None
+) -> tuple[Step, list[Row]]:
+    section = config.reconstruction
+    rows = [] if start is None else list(start.rows)
+    step = None if start is None else start.step
+    steps = descend(
+        data,
+        config.volume.grid,
+        config.volume.background,
+        config.microscope,
+        config.acquisition,
+        config.fidelity,
+        section,
+        step,
+    )
+    with _log(out / "log.csv", rows) as log, tqdm(total=section.steps, initial=len(rows), unit="step") as bar:
+        try:
+            for step in steps:
+                rows.append((step.number, step.misfit, step.loss, step.seconds))
+                log.writerow(rows[-1])
+                bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
+                bar.update()
+                if step.number % section.checkpoint_every == 0:
+                    checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
+        except KeyboardInterrupt:
+            if step is None:
+                raise Interrupted("interrupted before the first step") from None
+            checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
+            raise Interrupted(
+                f"interrupted after step {step.number} of {section.steps}; go on with --resume"
+            ) from None
+    assert step is not None
+    return step, rows
+
+
+@contextmanager
+def _log(path: Path, rows: list[Row]) -> Iterator["csv.Writer"]:
+    """log.csv open for further rows, the earlier ones in it already."""
+    with path.open("w", newline="", encoding="utf-8", buffering=1) as file:
+        writer = csv.writer(file)
+        writer.writerow(("step", "misfit", "loss", "seconds"))
+        writer.writerows(rows)
+        yield writer
+
+
+def _write_text(path: Path, text: str) -> None:
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def _metrics(
+    config: Config, measured: Measured, modelled: Tensor, data: Tensor, delta: Tensor, last: Step
+) -> dict[str, object]:
+    variance = spatial_variance(data)
+    noise = [report.noise for report in measured.prisms]
+    floor = None
+    if None not in noise:
+        floor = sum(n**2 / v for n, v in zip(noise, variance.tolist(), strict=True)) / len(noise)  # pyright: ignore[reportOptionalOperand]
+    return {
+        "misfit": float(gaussian(modelled, data, variance)),
+        "noise_misfit": floor,
+        "residual_rms": residual_rms(modelled, data),
+        "steps": last.number,
+        "seconds": round(last.seconds, 3),
+        "propagation": config.fidelity.propagation,
+        "delta": {"min": float(delta.min()), "max": float(delta.max()), "mean": float(delta.mean())},
+        "prisms": [asdict(report) for report in measured.prisms],
+    }

@@ -1,0 +1,62 @@
+"""Images of a known specimen: through one of the propagations, or from its exact field."""
+
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, image_field
+
+# The exact field is spread over an array so many times as wide and cropped after imaging: what leaves the volume's
+# sides must not come back on the other one.
+WIDTH = 2
+
+
+class ExactSpecimen(Protocol):
+    """A specimen that knows the exact field behind it."""
+
+    @property
+    def background(self) -> float:
+        """Index of the medium around it."""
+        ...
+
+    def field(
+        self,
+        grid: Grid,
+        wavelength: float,
+        points: Tensor,
+        plane: float = 0.0,
+        *,
+        padding: float,
+        na: float | None,
+    ) -> Complex[Tensor, "source y x"]:
+        """Each source's envelope at depth `plane`, on the grid's pixels."""
+        ...
+
+
+@torch.no_grad()
+def exact_images(
+    specimen: ExactSpecimen, grid: Grid, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
+) -> Float[Tensor, "prism focus y x"]:
+    """Images of a specimen from its exact field, float64: none of our propagations takes part."""
+    nz, ny, nx = grid.shape
+    wide = replace(grid, shape=(nz, WIDTH * ny, WIDTH * nx))
+    points, weights = microscope.sources(fidelity, dtype=torch.float64, device=torch.device("cpu"))
+    na = None
+    if microscope.objective is not None:
+        na = min(1.05 * microscope.objective.na, specimen.background)
+    total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), ny, nx, dtype=torch.float64)
+    top, left = (WIDTH - 1) * ny // 2, (WIDTH - 1) * nx // 2
+    for some, share in zip(points.split(16), weights.split(16), strict=True):
+        part = replace(microscope, condenser=Condenser(microscope_na(microscope), some, share))
+        field = specimen.field(wide, microscope.wavelength, some, padding=1.0, na=na)
+        images = image_field(field, wide, part, acquisition, background=specimen.background)
+        total += float(share.sum()) * images[..., top : top + ny, left : left + nx]
+    return total
+
+
+def microscope_na(microscope: Microscope) -> float:
+    """The condenser's aperture; 0 without a condenser."""
+    return 0.0 if microscope.condenser is None else microscope.condenser.na
