@@ -1,10 +1,15 @@
-"""Annotations are enforced here, and only here: every call in a test checks the shapes and types it was promised."""
+"""Annotations are enforced here, and only here: each call checks the shapes and types it was promised."""
 
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+# Idle OpenMP threads sleep: on a shared machine spinning ones cost small tensors a hundredfold.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import torch
 from jaxtyping import install_import_hook
 

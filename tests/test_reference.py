@@ -1,0 +1,113 @@
+"""Images of known answer in tests/data: their README says who computed them, and how. None is ours."""
+
+import pytest
+import torch
+
+from data_synthetic import Bead, GaussianBall
+from torchdic import (
+    Acquisition,
+    Condenser,
+    Fidelity,
+    Grid,
+    Microscope,
+    Objective,
+    Prism,
+    Volume,
+    image,
+    image_field,
+)
+
+
+def contrast_error(images, expected):
+    """Rms difference over the expected image's standard deviation, per prism and focus."""
+    difference = (images.double() - expected.double()).square().mean((-1, -2)).sqrt()
+    return difference / expected.double().std((-1, -2), correction=0)
+
+
+@pytest.mark.parametrize("specimen", ["gauss", "asym"])
+def test_thin_object_agrees_with_the_reference_implementation(load, specimen):
+    data = load("thin_dic")
+    transmission = data[f"object_{specimen}"]
+    spacing = float(data["spacing"])
+    grid = Grid((1, *transmission.shape), (1.0, spacing, spacing))
+    microscope = Microscope(
+        float(data["wavelength"]),
+        Objective(float(data["na_objective"])),
+        Condenser(float(data["na_condenser"]), points=data["source_na_yx"]),
+    )
+    prism = Prism(tuple(data["shear_yx"].tolist()), float(data["bias"]))
+    images = image_field(
+        transmission, grid, microscope, Acquisition([prism, None]), background=float(data["n_medium"])
+    )
+    in_focus = data["focus_paraxial"].tolist().index(0.0)
+    # the reference summed in single precision: 1e-6 for DIC, 2e-6 for bright field
+    for found, kind in zip(images[:, 0], ("dic", "brightfield"), strict=True):
+        assert float((found - data[f"{kind}_{specimen}"][in_focus]).abs().max()) < 2e-6
+
+
+def test_thin_object_does_not_agree_with_a_mirrored_or_transposed_one(load):
+    """The reference is asymmetric enough for the comparison above to notice a swapped axis or sign."""
+    data = load("thin_dic")
+    expected = data["dic_asym"][data["focus_paraxial"].tolist().index(0.0)]
+    for wrong in (expected.flip(0), expected.flip(1), expected.T):
+        assert float((wrong - expected).abs().max()) > 0.01
+
+
+def setup(data):
+    """Microscope and acquisition of the exact ball and sphere; sources are direction cosines there."""
+    points = data["source_yx"] * data["n_medium"]
+    microscope = Microscope(
+        float(data["wavelength"]),
+        Objective(float(data["na_objective"])),
+        Condenser(float(points.norm(dim=-1).max()), points=points),
+    )
+    prisms = [Prism(tuple(s.tolist()), float(b)) for s, b in zip(data["shear_yx"], data["bias"], strict=True)]
+    return microscope, Acquisition(prisms, data["focus"].tolist())
+
+
+@pytest.mark.parametrize(
+    ("fidelity", "tolerance"),
+    [
+        (Fidelity("rays", steps=24), 0.005),
+        pytest.param(Fidelity("rays"), 0.0025, marks=pytest.mark.slow),
+        pytest.param(Fidelity("rays", interpolation="cubic", steps=24), 0.002, marks=pytest.mark.slow),
+        (Fidelity("wave"), 0.002),
+        (Fidelity("wave", order=1), 0.005),
+    ],
+    ids=["rays-in-24-steps", "rays", "rays-cubic", "wave", "wave-first-order"],
+)
+def test_smooth_ball_agrees_with_the_exact_field(load, fidelity, tolerance):
+    """Gaussian ball, Δn 0.03, σ 2 µm: smooth on the scale of λ, where rays and the one-way wave both hold."""
+    data = load("exact_ball_dic")
+    spacing = float(data["spacing"])
+    grid = Grid((120, *data["images"].shape[-2:]), (spacing,) * 3)
+    ball = GaussianBall(float(data["sigma"]), float(data["delta_peak"]), float(data["n_medium"]))
+    microscope, acquisition = setup(data)
+    volume = Volume(grid, ball.delta(grid, torch.float32), ball.background)
+    with torch.no_grad():
+        images = image(volume, microscope, acquisition, fidelity)
+    error = contrast_error(images, data["images"])
+    assert float(error.max()) < tolerance, error
+
+
+@pytest.mark.parametrize(
+    ("fidelity", "tolerance", "floor"),
+    [
+        (Fidelity("wave"), 0.03, 0.0),
+        pytest.param(Fidelity("projection"), 1.0, 0.1, marks=pytest.mark.slow),
+        pytest.param(Fidelity("rays", steps=48), 1.0, 0.1, marks=pytest.mark.slow),
+    ],
+    ids=["wave", "projection", "rays"],
+)
+def test_bead_in_optical_cement_agrees_with_the_exact_field(load, fidelity, tolerance, floor):
+    """The paper's bead: its sharp edge diffracts. Straight or bent, rays err by more than `floor`."""
+    data = load("exact_sphere_dic")
+    spacing = float(data["spacing"])
+    grid = Grid((164, *data["images"].shape[-2:]), (0.0625, spacing, spacing))
+    n0 = float(data["n_medium"])
+    bead = Bead(float(data["radius"]), float(data["n_sphere"]) - n0, n0)
+    microscope, acquisition = setup(data)
+    with torch.no_grad():
+        images = image(Volume(grid, bead.delta(grid, torch.float32), n0), microscope, acquisition, fidelity)
+    error = contrast_error(images, data["images"])
+    assert floor <= float(error.max()) < tolerance, error
