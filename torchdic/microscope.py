@@ -152,7 +152,7 @@ def image_field(
         raise ValueError(
             f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}"
         )
-    n0 = torch.as_tensor(background).to(real)
+    n0 = torch.as_tensor(background, dtype=real.dtype, device=real.device)
     pad = fidelity.padding
     grid = _wider(grid, pad)
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
@@ -194,7 +194,7 @@ def form_image(
     transfers = [None if prism is None else prism.transfer(frequencies) for prism in acquisition.prisms]
     images = []
     for focus in acquisition.focus:
-        sharp = spectrum * exp_i(k0 * (torch.as_tensor(focus).to(difference) - plane) * difference)
+        sharp = spectrum * exp_i(k0 * (torch.as_tensor(focus, dtype=difference.dtype, device=difference.device) - plane) * difference)
         for transfer in transfers:
             field = to_field(sharp if transfer is None else sharp * transfer)
             images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))

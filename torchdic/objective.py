@@ -43,7 +43,7 @@ class Objective:
         pupil = momentum / self.na
         rho, theta = pupil.square().sum(1).sqrt(), torch.atan2(pupil[:, 0], pupil[:, 1])
         terms = [
-            torch.as_tensor(value).to(rho) * zernike(index, rho, theta)
+            torch.as_tensor(value, dtype=rho.dtype, device=rho.device) * zernike(index, rho, theta)
             for index, value in self.aberrations.items()
         ]
         return torch.stack(terms).sum(0)

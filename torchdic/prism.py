@@ -34,6 +34,6 @@ class Prism:
         It is taken at the envelope's frequency f, not at the field's f + f_s: the condenser prism at work, which
         cancels the tilt's phase.
         """
-        y, x = (torch.as_tensor(s).to(frequencies) for s in self.shear)
-        half_bias = torch.as_tensor(self.bias).to(frequencies) / 2
+        y, x = (torch.as_tensor(s, dtype=frequencies.dtype, device=frequencies.device) for s in self.shear)
+        half_bias = torch.as_tensor(self.bias, dtype=frequencies.dtype, device=frequencies.device) / 2
         return torch.sin(math.pi * (frequencies[0] * y + frequencies[1] * x) + half_bias)

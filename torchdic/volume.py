@@ -44,7 +44,7 @@ class Volume(nn.Module):
             raise ValueError(f"index {lowest:g} = background {index:g} + delta must stay above 0")
         self.grid = grid
         self._keep("delta", delta)
-        self._keep("background", torch.as_tensor(background).to(delta))
+        self._keep("background", torch.as_tensor(background, dtype=delta.dtype, device=delta.device))
         self._keep("absorption", None if absorption is None else absorption.to(delta))
 
     def _keep(self, name: str, value: Tensor | None) -> None:
