@@ -46,9 +46,7 @@ class CellPhantom(Specimen):
         for name, part, host in parts:
             require_contrast(name, self.background, part.contrast)
             if not bool(host.shape.contains(part.shape.surface()).all()):
-                raise ValueError(
-                    f"{name} at {part.shape.centre} µm sticks out of the part of the cell that it lies in"
-                )
+                raise ValueError(f"{name} at {part.shape.centre} µm sticks out of the part of the cell that it lies in")
         for i, (name, part, host) in enumerate(parts):
             for other_name, other, other_host in parts[:i]:
                 apart = not (

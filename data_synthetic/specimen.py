@@ -76,9 +76,7 @@ def require_contrast(name: str, background: float, contrast: float) -> None:
     """Raise ValueError unless the background and the background + contrast are refractive indices."""
     require_index("background", background)
     if not (math.isfinite(contrast) and background + contrast >= 1):
-        raise ValueError(
-            f"index {background} + ({contrast}) of the {name} must be at least 1, the index of vacuum"
-        )
+        raise ValueError(f"index {background} + ({contrast}) of the {name} must be at least 1, the index of vacuum")
 
 
 def require_vector(name: str, value: Sequence[float], axes: str) -> None:

@@ -59,15 +59,11 @@ class EtchedGlassStep(Specimen):
         """
         return self.height * (self.glass - self.background)
 
-    def surface_height(
-        self, y: Float[Tensor, "*point"], x: Float[Tensor, "*point"]
-    ) -> Float[Tensor, "*point"]:
+    def surface_height(self, y: Float[Tensor, "*point"], x: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
         """The z in µm of the glass surface at (y, x) in µm."""
         uy, ux = (u / math.hypot(*self.direction) for u in self.direction)
         u = uy * y + ux * x - self.offset
-        return self.surface + self.height / 2 * (
-            torch.tanh(u / self.edge) if self.edge > 0 else torch.sign(u)
-        )
+        return self.surface + self.height / 2 * (torch.tanh(u / self.edge) if self.edge > 0 else torch.sign(u))
 
     def _delta(self, grid: Grid) -> Float[Tensor, "z y x"]:
         def surfaces(y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:

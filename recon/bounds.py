@@ -36,9 +36,7 @@ class Bounds:
             return self.lower + F.softplus(parameter, beta=SHARPNESS)
         if self.lower is None:
             return self.upper - F.softplus(-parameter, beta=SHARPNESS)
-        return self.lower + (self.upper - self.lower) * torch.sigmoid(
-            4 * parameter / (self.upper - self.lower)
-        )
+        return self.lower + (self.upper - self.lower) * torch.sigmoid(4 * parameter / (self.upper - self.lower))
 
     def parameter(self, delta: Tensor, margin: float) -> Tensor:
         """The parameter whose Δn is the given one, kept `margin` away from the bounds so that it can still move."""

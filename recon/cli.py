@@ -6,6 +6,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,7 +18,7 @@ from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
 from recon.config import Config, ConfigError, load, structure
 from recon.descend import Recipe
-from recon.reconstruct import Interrupted, prepare_folder, reconstruct
+from recon.reconstruct import InterruptedRunError, prepare_folder, reconstruct
 from recon.simulate import exact_images
 from torchdic import (
     Acquisition,
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
-    except (Interrupted, KeyboardInterrupt) as error:
+    except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
     return 0
 
@@ -65,16 +66,12 @@ def _demo(options: argparse.Namespace) -> None:
     bead = Bead(radius=2.5, contrast=0.03, background=1.56)
     grid = Grid((20, 64, 64), (0.4, 0.17, 0.17))
     microscope = Microscope(0.546, Objective(0.9), Condenser(0.7))
-    prisms = [
-        Prism(shear, bias) for shear in ((0.0, 0.24), (0.24, 0.0)) for bias in (math.pi / 2, -math.pi / 2)
-    ]
+    prisms = [Prism(shear, bias) for shear in ((0.0, 0.24), (0.24, 0.0)) for bias in (math.pi / 2, -math.pi / 2)]
     acquisition = Acquisition(prisms, [float(z) for z in range(-4, 5)])
     print("A 5 µm bead of index 1.59 in cement of 1.56: DIC stack from its exact field …", flush=True)
     data = exact_images(bead, grid, microscope, acquisition, Fidelity(sources=150)).float()
     write_stack(options.out / "stack.ome.tif", data, grid.spacing[1:], 1.0)
-    figures.save(
-        figures.draw_stack(data, prisms, acquisition.focus, grid.spacing[1:]), options.out / "stack.png"
-    )
+    figures.save(figures.draw_stack(data, prisms, acquisition.focus, grid.spacing[1:]), options.out / "stack.png")
     truth = bead.delta(grid, dtype=torch.float32)
     contenders = [
         (Fidelity("projection"), Recipe(steps=60)),
@@ -113,16 +110,12 @@ def _simulate(options: argparse.Namespace) -> None:
     else:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-            images = image(
-                Volume(grid, delta, specimen.background), microscope, acquisition, config.fidelity
-            ).cpu()
+            images = image(Volume(grid, delta, specimen.background), microscope, acquisition, config.fidelity).cpu()
     if microscope.camera is not None:
         images = microscope.camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
     focus = [float(f) for f in acquisition.focus]
     write_stack(options.out / "stack.ome.tif", images.float(), grid.spacing[1:], _equal_step(focus))
-    figures.save(
-        figures.draw_stack(images, acquisition.prisms, focus, grid.spacing[1:]), options.out / "stack.png"
-    )
+    figures.save(figures.draw_stack(images, acquisition.prisms, focus, grid.spacing[1:]), options.out / "stack.png")
     print(f"{options.out / 'stack.ome.tif'}: {_counts(images.shape)}")
 
 
@@ -143,16 +136,14 @@ def _specimen(config: Config, source: str) -> Any:
     values = dict(config.specimen)
     kind = values.pop("kind", None)
     if kind not in SPECIMENS:
-        raise ConfigError(
-            f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}"
-        )
+        raise ConfigError(f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}")
     values.setdefault("background", config.volume.background)
     return structure(values, SPECIMENS[kind], source, "specimen")
 
 
 def _equal_step(focus: Sequence[float]) -> float | None:
     """The distance between focus planes, None where they are not equally spaced upwards."""
-    steps = [b - a for a, b in zip(focus[:-1], focus[1:], strict=True)]
+    steps = [b - a for a, b in pairwise(focus)]
     if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
         return None
     return steps[0]
@@ -181,16 +172,10 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(command=_demo)
     simulate = commands.add_parser("simulate", parents=[config, out, device], help="DIC stack of a specimen")
     simulate.set_defaults(command=_simulate)
-    fit = commands.add_parser(
-        "reconstruct", parents=[config, out, device], help="index volume behind a DIC stack"
-    )
+    fit = commands.add_parser("reconstruct", parents=[config, out, device], help="index volume behind a DIC stack")
     again = fit.add_mutually_exclusive_group()
-    again.add_argument(
-        "--resume", action="store_true", help="go on with an interrupted run in DIR, if there is one"
-    )
-    again.add_argument(
-        "--restart", action="store_true", help="begin anew in spite of an interrupted run in DIR"
-    )
+    again.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR, if there is one")
+    again.add_argument("--restart", action="store_true", help="begin anew in spite of an interrupted run in DIR")
     fit.set_defaults(command=_reconstruct)
     return parser
 
@@ -201,9 +186,7 @@ def _device(name: str) -> torch.device:
     try:
         return torch.zeros(1, device=name).device
     except (RuntimeError, AssertionError) as error:
-        raise argparse.ArgumentTypeError(
-            f"{name!r} is no device here: {str(error).splitlines()[0]}"
-        ) from error
+        raise argparse.ArgumentTypeError(f"{name!r} is no device here: {str(error).splitlines()[0]}") from error
 
 
 def _interrupt(_number: int, _frame: object) -> NoReturn:

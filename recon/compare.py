@@ -43,11 +43,8 @@ def compare(
     volumes, trials = {"truth": truth}, []
     for fidelity, recipe in contenders:
         name = fidelity.propagation
-        step = None
         steps = descend(data, grid, background, microscope, acquisition, fidelity, recipe)
-        for step in tqdm(steps, desc=f"{name:>10}", total=recipe.steps, unit="step"):
-            pass
-        assert step is not None
+        *_, step = tqdm(steps, desc=f"{name:>10}", total=recipe.steps, unit="step")
         delta = step.delta.cpu()
         trials.append(
             Trial(

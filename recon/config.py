@@ -121,7 +121,7 @@ def load(path: str | os.PathLike[str]) -> Config:
 
 
 def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
-    """An instance of a dataclass from plain values. Raises ConfigError that names `source` and the key (below `where`)."""
+    """A dataclass from plain values. Raises ConfigError that names `source` and the key (below `where`)."""
     try:
         return converter.structure(values, kind)
     except Exception as error:

@@ -58,8 +58,8 @@ class Recipe:
 class Step:
     """One step of a descent, and all that is needed to go on from it: nothing in it changes any more.
 
-    number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it. seconds: that
-    the descent has taken, its start included. parameter, optimiser: the learned tensor and Adam's state.
+    number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it.
+    seconds: that the descent has taken, its start included. parameter, optimiser: the learned tensor, Adam's state.
     """
 
     number: int
@@ -88,9 +88,7 @@ def descend(
     """
     expected = (len(acquisition.prisms), len(acquisition.focus), *grid.shape[1:])
     if tuple(data.shape) != expected:
-        raise ValueError(
-            f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}"
-        )
+        raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}")
     started = time.perf_counter()
     variance = spatial_variance(data)
     if resume is None:
@@ -107,9 +105,7 @@ def descend(
     for number in range(first, recipe.steps):
         adam.param_groups[0]["lr"] = cosine(number, recipe.steps, recipe.learning_rate)
         delta = recipe.bounds.delta(parameter)
-        images = image(
-            Volume(grid, delta, background), microscope, acquisition, _draft(fidelity, recipe, number)
-        )
+        images = image(Volume(grid, delta, background), microscope, acquisition, _draft(fidelity, recipe, number))
         misfit = gaussian(images, data, variance)
         loss = misfit
         tv = held_then_annealed(number, recipe.steps, *recipe.tv)
@@ -121,9 +117,7 @@ def descend(
         loss.backward()
         adam.step()
         if not math.isfinite(float(loss)) or not bool(torch.isfinite(parameter).all()):
-            raise FloatingPointError(
-                f"the descent diverged at step {number + 1}: the loss is {float(loss):g}"
-            )
+            raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {float(loss):g}")
         with torch.no_grad():
             delta = recipe.bounds.delta(parameter)
         yield Step(

@@ -74,9 +74,7 @@ def draw_sections(
     shown = None
     for column, (title, volume) in zip(axes.T, volumes.items(), strict=True):
         for ax, name in zip(column, planes, strict=True):
-            section = {"xy": volume[through[0]], "xz": volume[:, through[1]], "yz": volume[:, :, through[2]]}[
-                name
-            ]
+            section = {"xy": volume[through[0]], "xz": volume[:, through[1]], "yz": volume[:, :, through[2]]}[name]
             spacing = [grid.spacing["zyx".index(letter)] for letter in (name[1], name[0])]
             shown = _show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
@@ -141,9 +139,7 @@ def _scale_bar(ax: Axes, width: float, colour: str) -> None:
     length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)
     bottom, top = ax.get_ylim()
     height = abs(bottom - top)
-    ax.add_patch(
-        Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0)
-    )
+    ax.add_patch(Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0))
     ax.text(
         0.05 * width,
         bottom - 0.09 * height,
@@ -171,6 +167,4 @@ def _centre(volume: Tensor) -> tuple[int, int, int]:
 def _caption(prism: Prism | None) -> str:
     if prism is None:
         return "bright field"
-    return (
-        f"shear ({float(prism.shear[0]):g}, {float(prism.shear[1]):g}) µm\nbias {float(prism.bias):.3g} rad"
-    )
+    return f"shear ({float(prism.shear[0]):g}, {float(prism.shear[1]):g}) µm\nbias {float(prism.bias):.3g} rad"

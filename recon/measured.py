@@ -122,8 +122,7 @@ def _in_model_unit(
     level, lowest = float(surface.mean()), float(surface.min())
     if lowest <= 0 and (scale == "background" or (flatten and not extinct)):
         raise StackError(
-            f"{label}'s background less the offset {offset:g} falls to {lowest:.4g}; "
-            "it must stay above 0 to divide by"
+            f"{label}'s background less the offset {offset:g} falls to {lowest:.4g}; it must stay above 0 to divide by"
         )
     unit = level / expected if scale == "background" else float(scale)
     scaled = np.empty(images.shape, np.float32)

@@ -14,8 +14,6 @@ def mean_inside(delta: Float[Tensor, "z y x"], inside: Bool[Tensor, "z y x"]) ->
     return float(delta[inside].mean())
 
 
-def residual_rms(
-    images: Float[Tensor, "prism focus y x"], data: Float[Tensor, "prism focus y x"]
-) -> list[float]:
+def residual_rms(images: Float[Tensor, "prism focus y x"], data: Float[Tensor, "prism focus y x"]) -> list[float]:
     """Each prism's rms residual, in units of the empty bright field."""
     return (images - data).square().mean((1, 2, 3)).sqrt().tolist()

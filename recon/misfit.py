@@ -13,9 +13,7 @@ def spatial_variance(data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, " 
     variance = data.var(dim=(2, 3), correction=0).mean(1)
     for prism, value in enumerate(variance.tolist()):
         if not value > 0:
-            raise ValueError(
-                f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit"
-            )
+            raise ValueError(f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit")
     return variance
 
 

@@ -27,7 +27,7 @@ from torchdic.tiff import StackError, read_stack, write_volume
 CHECKPOINT = "checkpoint.pt"
 
 
-class Interrupted(Exception):
+class InterruptedRunError(Exception):
     """The user stopped a descent; its message says how to go on."""
 
 
@@ -68,8 +68,8 @@ def reconstruct(
     """Fit a volume to the configuration's stack and leave it in `out`, with metrics, log, configuration and figures.
 
     resume: go on from the checkpoint in `out`, if there is one. restart: begin anew in spite of one.
-    Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; Interrupted on Ctrl-C,
-    with a checkpoint saved.
+    Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; InterruptedRunError on
+    Ctrl-C, with a checkpoint saved.
     """
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
@@ -80,9 +80,7 @@ def reconstruct(
         if resume:
             start = checkpoint.load(saved, identity)
         elif not restart:
-            raise CheckpointError(
-                f"{saved}: an interrupted run; go on with --resume or begin anew with --restart"
-            )
+            raise CheckpointError(f"{saved}: an interrupted run; go on with --resume or begin anew with --restart")
     prepare_folder(out)
     _write_text(out / "config.toml", dump(config))
 
@@ -141,9 +139,9 @@ def _descend(
                     checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
         except KeyboardInterrupt:
             if step is None:
-                raise Interrupted("interrupted before the first step") from None
+                raise InterruptedRunError("interrupted before the first step") from None
             checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
-            raise Interrupted(
+            raise InterruptedRunError(
                 f"interrupted after step {step.number} of {section.steps}; go on with --resume"
             ) from None
     assert step is not None

@@ -32,9 +32,7 @@ class ShearAxis:
     uncertainty: float
 
 
-def estimate_shear_axis(
-    image: Real[np.ndarray, "y x"], pixel_size: tuple[float, float] = (1.0, 1.0)
-) -> ShearAxis:
+def estimate_shear_axis(image: Real[np.ndarray, "y x"], pixel_size: tuple[float, float] = (1.0, 1.0)) -> ShearAxis:
     """Estimate the shear axis from one DIC image (y, x), in any linear unit; pixel_size (y, x) in any length.
 
     A weak phase φ shows as I ≈ background + ½ sin(bias) s·∇φ, with power P ∝ (f·s)²|Φ(f)|²: around each

@@ -12,7 +12,7 @@ from torch import Tensor
 class Camera:
     """A camera that counts photoelectrons.
 
-    photons: electrons per pixel in the empty bright field; None is a camera without shot noise. read_noise: its standard
+    photons: electrons per pixel in the empty bright field; None is a camera without shot noise. read_noise: standard
     deviation in electrons; None is none. `torchdic.image` gives the expected intensity; `record` draws from it.
     Raises ValueError where a number isn't positive, or read noise has no photons to be compared with.
     """
@@ -28,16 +28,12 @@ class Camera:
         if self.read_noise is not None and self.photons is None:
             raise ValueError(f"read_noise {self.read_noise} electrons needs photons to be compared with")
 
-    def record(
-        self, intensity: Float[Tensor, "*image"], generator: torch.Generator
-    ) -> Float[Tensor, "*image"]:
+    def record(self, intensity: Float[Tensor, "*image"], generator: torch.Generator) -> Float[Tensor, "*image"]:
         """One noisy recording of an intensity, both relative to the empty bright field; its shape, dtype and device."""
         if self.photons is None:
             return intensity
         electrons = torch.poisson(intensity * self.photons, generator=generator)
         if self.read_noise is not None:
-            noise = torch.randn(
-                intensity.shape, generator=generator, dtype=intensity.dtype, device=intensity.device
-            )
+            noise = torch.randn(intensity.shape, generator=generator, dtype=intensity.dtype, device=intensity.device)
             electrons = electrons + self.read_noise * noise
         return electrons / self.photons

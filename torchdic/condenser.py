@@ -37,9 +37,7 @@ class Condenser:
         if self.weights is not None:
             weights = torch.as_tensor(self.weights)
             if tuple(weights.shape) != (len(points),):
-                raise ValueError(
-                    f"condenser has {len(points)} points and weights of shape {tuple(weights.shape)}"
-                )
+                raise ValueError(f"condenser has {len(points)} points and weights of shape {tuple(weights.shape)}")
             if not (bool((weights >= 0).all()) and 0 < float(weights.sum()) < float("inf")):
                 raise ValueError("condenser weights must be at least 0, with a positive finite sum")
             object.__setattr__(self, "weights", weights)
@@ -47,7 +45,7 @@ class Condenser:
     def sources(
         self, count: int, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
-        """Directions n·sinθ (source, 2) and weights (source,) that sum to 1; at most `count` unless points are given."""
+        """Directions n·sinθ (source, 2) and weights (source,) of sum 1; at most `count` unless points are given."""
         if self.points is not None:
             points = self.points
             weights = torch.ones(len(points)) if self.weights is None else self.weights

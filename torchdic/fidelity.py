@@ -16,12 +16,12 @@ class Fidelity:
 
     propagation: how light crosses the specimen: "projection" along straight rays, "rays" along bent ones (the ray ODE),
         "wave" by the split-step solution of the one-way wave equation.
-    steps: equal steps (rays) or slabs (wave) through the whole volume; None is one per slice. Fewer average slices, more
-        subdivide them. Projection ignores it.
+    steps: equal steps (rays) or slabs (wave) through the whole volume; None is one per slice. Fewer average slices,
+        more subdivide them. Projection ignores it.
     sources: condenser directions at most, where the condenser names no points of its own.
     interpolation: between voxel centres, "linear" or "cubic" (C² spline); the wave reads voxels as they are.
-    solver: torchdiffeq's method for rays. The adaptive ones (bosh3, dopri5, dopri8) hold every single ray to `tolerance`
-        and ignore `steps`.
+    solver: torchdiffeq's method for rays. The adaptive ones (bosh3, dopri5, dopri8) hold every single ray to
+        `tolerance` and ignore `steps`.
     tolerance: largest local error of an adaptive solver, absolute in µm and relative.
     amplitude: whether rays carry their energy's amplitude; False is for studying what it does.
     order: of the split step: 2 (4 FFTs a slab) or 1 (2 FFTs).

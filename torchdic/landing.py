@@ -1,7 +1,8 @@
 """Bent rays -> a complex field on the grid, at a reference plane inside the specimen.
 
-Exit rays are extended straight back, in the background, to a plane where the wavefront is smooth and displacements are
-small. There the mesh of rays is rasterised, triangle by triangle; where it folds, the field is the sum over the branches.
+Exit rays are extended straight back, in the background, to a plane where the wavefront is smooth and displacements
+are small. There the mesh of rays is rasterised, triangle by triangle; where it folds, the field is the sum over its
+branches.
 """
 
 import math
@@ -107,17 +108,13 @@ class _Mesh:
         self.home = torch.cartesian_prod(self._rows, self._columns) - MARGIN
         vertex = torch.arange(len(self.home), device=device).reshape(my + 2 * extra, mx + 2 * extra)
         a, b, c, d = vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, :-1], vertex[1:, 1:]
-        self.triangles = torch.stack((torch.stack((a, b, c), -1), torch.stack((d, c, b), -1)), 2).reshape(
-            -1, 3
-        )
+        self.triangles = torch.stack((torch.stack((a, b, c), -1), torch.stack((d, c, b), -1)), 2).reshape(-1, 3)
         self._extra, self._size = extra, (my, mx)
 
     def flat(self, values: Tensor) -> Tensor:
         """Values at the traced vertices (source, y, x, …) as (source, vertex, …), the outer ones included."""
         if self._extra:
-            values = values[:, self._rows.clamp(0, self._size[0] - 1)][
-                :, :, self._columns.clamp(0, self._size[1] - 1)
-            ]
+            values = values[:, self._rows.clamp(0, self._size[0] - 1)][:, :, self._columns.clamp(0, self._size[1] - 1)]
         return values.flatten(1, 2)
 
     def edges(self, displacement: Tensor) -> Tensor:
@@ -154,11 +151,7 @@ class _Mesh:
             # taken from the nearer end: a ray that lands almost on a pixel would drown in the rounding of the other
             direct = (pixel - start).square().sum(-1) <= (pixel - end).square().sum(-1)
             arm = pixel - torch.where(direct[:, None], start, end)
-            left = (
-                torch.where(direct, 1, -1)
-                * _cross(torch.where(direct[:, None], end - start, start - end), arm)
-                >= 0
-            )
+            left = torch.where(direct, 1, -1) * _cross(torch.where(direct[:, None], end - start, start - end), arm) >= 0
             inside &= (left == (one < other)) == orientation
         return source[inside], triangle[inside], pixel[inside]
 

@@ -27,26 +27,26 @@ def project(
         fields = [spline_coefficients(f) for f in fields]
     samplers = [SliceSampler(grid, f.unbind(0), fidelity.interpolation) for f in fields]
 
+    y, x = (grid.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
     p0 = momentum[:, None, None, :]
     pz0 = axial_momentum(n0, p0)
-    y, x = (grid.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
-    landing = torch.stack(torch.meshgrid(y, x, indexing="ij"), -1)
-    slope0 = p0 / pz0[..., None]
+    vy, vx = (p0 / pz0[..., None]).unbind(-1)
+    wide = (len(momentum), *grid.shape[1:])
 
     def cross(first: int, last: int, *sums: Tensor) -> tuple[Tensor, ...]:
         for i in range(first, last):
             z = grid.centre(0, i)
-            position = landing + slope0 * (z - plane)
-            delta = samplers[0].value(z, position)
+            position = (y[:, None] + vy * (z - plane)).expand(wide), (x + vx * (z - plane)).expand(wide)
+            delta = samplers[0].value(z, *position)
             n = n0 + delta
             pz = axial_momentum(n, p0)
             change = [delta * (n + n0) / (pz + pz0)]
             if len(samplers) == 2:
-                change.append(samplers[1].value(z, position) * n / pz)
+                change.append(samplers[1].value(z, *position) * n / pz)
             sums = tuple(s + grid.spacing[0] * c for s, c in zip(sums, change, strict=True))
         return sums
 
-    zero = momentum.new_zeros((len(momentum), *grid.shape[1:]))
+    zero = momentum.new_zeros(wide)
     sums = tuple(zero for _ in samplers)
     steps = grid.shape[0]
     crowded = kept_by_projection(grid, fidelity) * zero.numel() * zero.element_size() > fidelity.memory
@@ -59,4 +59,4 @@ def project(
 
 def kept_by_projection(grid: Grid, fidelity: Fidelity) -> int:
     """Values per source and pixel that autograd keeps for the backward pass."""
-    return 12 * grid.shape[0]
+    return 9 * grid.shape[0]

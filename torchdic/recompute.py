@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import TypeVar
 
 import torch
@@ -24,7 +25,7 @@ def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
     """Steps 0 … steps as consecutive (first, last) ranges: about √steps of them where `split`, or a single one."""
     count = math.isqrt(steps - 1) + 1 if split else 1
     edges = [i * steps // count for i in range(count + 1)]
-    yield from zip(edges[:-1], edges[1:], strict=True)
+    yield from pairwise(edges)
 
 
 def sum_over_sources(

@@ -37,34 +37,31 @@ class SliceSampler:
         self.grid, self.slices, self.interpolation, self.first = grid, slices, interpolation, first
 
     def sample(
-        self, z: float, position: Float[Tensor, "*ray 2"]
-    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, "*ray 2"]]:
-        """The field and its transverse gradient (1/µm) at depth z and positions (…, 2) in µm."""
-        spacing = position.new_tensor(self.grid.spacing[1:])
-        slice_ = self._blend(z)
+        self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
+    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
+        """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
+        field = self._blend(z)
         if self.interpolation == "cubic":
-            value, gradient = _sample_cubic(slice_, self._index(position))
+            value, slope_y, slope_x = _sample_cubic(field, *self._indices(y, x))
         else:
             # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
-            padded = F.pad(slice_[None], (2, 2, 2, 2), mode="replicate")[0]
-            gradient_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-            gradient_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
-            channels = torch.stack((padded[1:-1, 1:-1], gradient_y, gradient_x))
-            sampled = _sample_linear(channels, self._index(position) + 1)
-            value, gradient = sampled[0], sampled[1:].movedim(0, -1)
-        return value, gradient / spacing
+            padded = F.pad(field[None], (2, 2, 2, 2), mode="replicate")[0]
+            differences_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+            differences_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
+            channels = torch.stack((padded[1:-1, 1:-1], differences_y, differences_x))
+            value, slope_y, slope_x = _sample_linear(channels, *(i + 1 for i in self._indices(y, x)))
+        return value, slope_y / self.grid.spacing[1], slope_x / self.grid.spacing[2]
 
-    def value(self, z: float, position: Float[Tensor, "*ray 2"]) -> Float[Tensor, " *ray"]:
-        """The field alone at depth z and positions (…, 2) in µm."""
+    def value(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, " *ray"]:
+        """The field alone at depth z and positions (y, x) in µm."""
+        field = self._blend(z)
         if self.interpolation == "cubic":
-            return _sample_cubic(self._blend(z), self._index(position))[0]
-        return _sample_linear(self._blend(z)[None], self._index(position))[0]
+            return _sample_cubic(field, *self._indices(y, x))[0]
+        return _sample_linear(field[None], *self._indices(y, x))[0]
 
-    def _index(self, position: Tensor) -> Tensor:
-        return torch.stack(
-            [position[..., a] / self.grid.spacing[a + 1] + (self.grid.shape[a + 1] - 1) / 2 for a in (0, 1)],
-            -1,
-        )
+    def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
+        return y / dy + (ny - 1) / 2, x / dx + (nx - 1) / 2
 
     def _blend(self, z: float) -> Float[Tensor, "y x"]:
         weights = depth_weights(self.grid, z, self.interpolation)
@@ -114,38 +111,39 @@ def _bspline(t: float) -> tuple[float, float, float, float]:
     return ((1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (1 + 3 * t + 3 * t**2 - 3 * t**3) / 6, t**3 / 6)
 
 
-def _sample_linear(channels: Tensor, index: Tensor) -> Tensor:
-    """Channels (c, y, x) at fractional indices (…, 2): shape (c, …)."""
-    size = channels.shape[1:]
-    if 1 in size:  # grid_sample's coordinates, −1 … 1, need two points to stand on
-        channels = channels.repeat_interleave(1 + (size[0] == 1), 1).repeat_interleave(1 + (size[1] == 1), 2)
-    last = index.new_tensor([n - 1 for n in channels.shape[1:]])
-    normalised = (index * (2 / last) - 1).flip(-1).reshape(1, 1, -1, 2)
+def _sample_linear(channels: Tensor, iy: Tensor, ix: Tensor) -> Tensor:
+    """Channels (c, y, x) at fractional indices: shape (c, …)."""
+    for axis in (1, 2):  # grid_sample's coordinates, −1 … 1, need two points to stand on
+        if channels.shape[axis] == 1:
+            channels = channels.repeat_interleave(2, axis)
+    ny, nx = channels.shape[1:]
+    normalised = torch.stack((ix * (2 / (nx - 1)) - 1, iy * (2 / (ny - 1)) - 1), -1).reshape(1, 1, -1, 2)
     sampled = F.grid_sample(channels[None], normalised, padding_mode="border", align_corners=True)
-    return sampled.reshape(-1, *index.shape[:-1])
+    return sampled.reshape(-1, *iy.shape)
 
 
-def _sample_cubic(coefficients: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-    taps, weights, slopes = [], [], []
-    for axis, n in enumerate(coefficients.shape):
-        # clamp's gradient is 0 outside, and so are the mirrored spline's slopes at its ends
-        along = index[..., axis].clamp(0, n - 1)
-        base = along.detach().floor().clamp(max=max(n - 2, 0))
-        t = along - base
-        weights.append(
-            torch.stack(((1 - t) ** 3, 4 + t * t * (3 * t - 6), 1 + 3 * t * (1 + t - t * t), t**3), -1) / 6
-        )
-        slopes.append(torch.stack((-((1 - t) ** 2), t * (3 * t - 4), 1 + t * (2 - 3 * t), t * t), -1) / 2)
-        tap = base.long()[..., None] + torch.arange(-1, 3, device=index.device)
-        taps.append((n - 1) - ((n - 1) - tap.abs()).abs() if n > 1 else torch.zeros_like(tap))
-    (wy, wx), (sy, sx) = weights, slopes
-    flat = taps[0][..., :, None] * coefficients.shape[1] + taps[1][..., None, :]
+def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """A spline and its derivatives at fractional indices."""
+    rows, wy, sy = _spline_taps(iy, coefficients.shape[0])
+    columns, wx, sx = _spline_taps(ix, coefficients.shape[1])
+    flat = rows[..., :, None] * coefficients.shape[1] + columns[..., None, :]
     patch = coefficients.reshape(-1)[flat]
     along_x = (patch * wx[..., None, :]).sum(-1)
-    value = (along_x * wy).sum(-1)
-    gradient_y = (along_x * sy).sum(-1)
-    gradient_x = ((patch * sx[..., None, :]).sum(-1) * wy).sum(-1)
-    return value, torch.stack((gradient_y, gradient_x), -1)
+    slope_x = ((patch * sx[..., None, :]).sum(-1) * wy).sum(-1)
+    return (along_x * wy).sum(-1), (along_x * sy).sum(-1), slope_x
+
+
+def _spline_taps(index: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The four neighbours of a fractional index along an axis of n, with their weights and slopes."""
+    # clamp's gradient is 0 outside, and so is the mirrored spline's slope at its ends
+    along = index.clamp(0, n - 1)
+    base = along.detach().floor().clamp(max=max(n - 2, 0))
+    t = along - base
+    weights = torch.stack(((1 - t) ** 3, 4 + t * t * (3 * t - 6), 1 + 3 * t * (1 + t - t * t), t**3), -1) / 6
+    slopes = torch.stack((-((1 - t) ** 2), t * (3 * t - 4), 1 + t * (2 - 3 * t), t * t), -1) / 2
+    tap = base.long()[..., None] + torch.arange(-1, 3, device=index.device)
+    mirrored = (n - 1) - ((n - 1) - tap.abs()).abs() if n > 1 else torch.zeros_like(tap)
+    return mirrored, weights, slopes
 
 
 def window(grid: Grid, z0: float, z1: float, interpolation: Interpolation) -> slice:

@@ -80,9 +80,7 @@ class Stack:
 
     def __post_init__(self) -> None:
         if self.data.ndim != 4:
-            raise StackError(
-                f"{self.source}: data has {self.data.ndim} axes, a stack has 4 (prism, focus, y, x)"
-            )
+            raise StackError(f"{self.source}: data has {self.data.ndim} axes, a stack has 4 (prism, focus, y, x)")
 
     @property
     def is_integer(self) -> bool:
@@ -211,9 +209,7 @@ def _read(path: Path) -> Stack:
         _check_pixels_present(tif, series, path)
         data = series.asarray(squeeze=False)
         if data.shape != shape:
-            raise StackError(
-                f"{path}: holds {_by(data.shape)} pixels, its header says {_by(shape)} along {axes}"
-            )
+            raise StackError(f"{path}: holds {_by(data.shape)} pixels, its header says {_by(shape)} along {axes}")
         data = _arrange(data, axes, path)
         bits = page.bitspersample if isinstance(page.bitspersample, int) else None
     data = np.ascontiguousarray(data, dtype=data.dtype.newbyteorder("="))
@@ -301,16 +297,12 @@ def _ome_metadata(
     }
     if foreign:
         shown = ", ".join(sorted(foreign)[:3])
-        raise StackError(
-            f"{path}: its planes lie in {len(foreign)} other files ({shown}); a stack is one file"
-        )
+        raise StackError(f"{path}: its planes lie in {len(foreign)} other files ({shown}); a stack is one file")
     pixels = root.find(".//{*}Image/{*}Pixels")
     if pixels is None:
         raise StackError(f"{path}: its OME-XML describes no image")
     sizes = [
-        _micrometres(
-            float(pixels.get(f"PhysicalSize{axis}", "nan")), pixels.get(f"PhysicalSize{axis}Unit", "µm"), path
-        )
+        _micrometres(float(pixels.get(f"PhysicalSize{axis}", "nan")), pixels.get(f"PhysicalSize{axis}Unit", "µm"), path)
         for axis in "ZYX"
     ]
     names = tuple(channel.get("Name", "") for channel in pixels.findall("{*}Channel"))
@@ -341,9 +333,7 @@ def _micrometres(length: float, unit: str, path: Path) -> float | None:
         return None
     factor = _MICROMETRES.get(unit.strip(), _MICROMETRES.get(unit.strip().lower()))
     if factor is None:
-        warnings.warn(
-            f"{path}: a size of {length:g} {unit!r} is in no known length; left aside", StackWarning, 2
-        )
+        warnings.warn(f"{path}: a size of {length:g} {unit!r} is in no known length; left aside", StackWarning, 2)
         return None
     if not (math.isfinite(length) and length > 0):
         warnings.warn(f"{path}: a size of {length:g} {unit} is not above 0; ignored", StackWarning, 2)
@@ -431,9 +421,7 @@ def _check_finite(data: np.ndarray, path: Path) -> None:
     bad = data.size - int(np.isfinite(data).sum())
     if bad:
         nan = int(np.isnan(data).sum())
-        raise StackError(
-            f"{path}: {bad} of {data.size} pixels are not finite ({nan} NaN, {bad - nan} infinite)"
-        )
+        raise StackError(f"{path}: {bad} of {data.size} pixels are not finite ({nan} NaN, {bad - nan} infinite)")
 
 
 def _write_ome(

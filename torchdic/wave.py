@@ -110,7 +110,7 @@ def split_step(
 
 def kept_by_wave(grid: Grid, fidelity: Fidelity) -> int:
     """Values per source and pixel that autograd keeps for the backward pass."""
-    return {1: 16, 2: 24}[fidelity.order] * (fidelity.steps or grid.shape[0])
+    return {1: 10, 2: 13}[fidelity.order] * (fidelity.steps or grid.shape[0])
 
 
 def slab_mean(slices: Sequence[Tensor], step: int, steps: int) -> Tensor:
