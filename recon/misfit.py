@@ -1,5 +1,6 @@
 """How far the model's images are from the measured ones."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -11,8 +12,9 @@ def spatial_variance(data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, " 
     specimen. Raises ValueError where a prism's images are uniform: there is nothing to fit.
     """
     variance = data.var(dim=(2, 3), correction=0).mean(1)
-    for prism, value in enumerate(variance.tolist()):
-        if not value > 0:
+    rounding = (4 * torch.finfo(data.dtype).eps * data.abs().amax((1, 2, 3))).square()
+    for prism, (value, least) in enumerate(zip(variance.tolist(), rounding.tolist(), strict=True)):
+        if not value > least:
             raise ValueError(f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit")
     return variance
 
