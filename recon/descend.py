@@ -116,14 +116,18 @@ def descend(
         adam.zero_grad()
         loss.backward()
         adam.step()
-        if not math.isfinite(float(loss)) or not bool(torch.isfinite(parameter).all()):
-            raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {float(loss):g}")
+        misfit, loss = float(misfit.detach()), float(loss.detach())
         with torch.no_grad():
             delta = recipe.bounds.delta(parameter)
+        if not math.isfinite(loss) or not bool(torch.isfinite(delta).all()):
+            raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {loss:g}")
+        lowest = background + float(delta.min())
+        if lowest <= 0:
+            raise FloatingPointError(f"the descent diverged at step {number + 1}: the index falls to {lowest:g}")
         yield Step(
             number + 1,
-            float(misfit),
-            float(loss),
+            misfit,
+            loss,
             delta,
             seconds + time.perf_counter() - started,
             parameter.detach().clone(),
