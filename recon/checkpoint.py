@@ -20,7 +20,7 @@ class Checkpoint:
     """A step of a descent and the log up to it.
 
     step: to go on from. rows: (step, misfit, loss, seconds) of every step so far. identity: what the descent depends
-    on, the resolved configuration and the data's digest, line by line.
+    on, the resolved configuration and the data's digest, a line `key = value` each.
     """
 
     step: Step
@@ -41,12 +41,18 @@ def load(path: Path, identity: str) -> Checkpoint:
         content = torch.load(path, map_location="cpu", weights_only=True)
         checkpoint = Checkpoint(Step(**content["step"]), content["rows"], content["identity"])
     except Exception as error:
-        raise CheckpointError(f"{path}: is no checkpoint of this version: {error}") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise CheckpointError(f"{path}: is no checkpoint of this version: {reason}") from error
     if checkpoint.identity != identity:
-        theirs, ours = checkpoint.identity.splitlines(), identity.splitlines()
-        changed = next(
-            (f"{a!r} became {b!r}" for a, b in zip(theirs, ours, strict=False) if a != b),
-            "lines were added or removed",
+        theirs, ours = _values(checkpoint.identity), _values(identity)
+        changed = next(key for key in theirs | ours if theirs.get(key) != ours.get(key))
+        raise CheckpointError(
+            f"{path}: belongs to another configuration or other data: "
+            f"{changed} was {theirs.get(changed, 'absent')}, is {ours.get(changed, 'absent')}"
         )
-        raise CheckpointError(f"{path}: belongs to another configuration or other data: {changed}")
     return checkpoint
+
+
+def _values(identity: str) -> dict[str, str]:
+    parts = (line.partition(" = ") for line in identity.splitlines())
+    return {key: value for key, _, value in parts}

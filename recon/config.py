@@ -8,16 +8,17 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 import cattrs
 import tomli_w
 import torch
 from cattrs import transform_error
-from cattrs.errors import ForbiddenExtraKeysError
+from cattrs.errors import ForbiddenExtraKeysError, IterableValidationError, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
@@ -27,6 +28,7 @@ from torchdic.microscope import check_apertures
 
 T = TypeVar("T")
 BRIGHT_FIELD = "brightfield"
+NONE = "none"  # TOML has no null: this is how to switch off what has a default
 
 
 class ConfigError(ValueError):
@@ -61,6 +63,14 @@ class DataSection:
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
     order: int = 2
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scale, str | None) and not (0 < self.scale < math.inf):
+            raise ValueError(f"scale {self.scale} must be above 0")
+        if not math.isfinite(self.offset):
+            raise ValueError(f"offset {self.offset} must be finite")
+        if self.order < 0:
+            raise ValueError(f"order {self.order} must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -132,8 +142,24 @@ def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
 
 
 def dump(config: Config) -> str:
-    """The resolved configuration as TOML: every default spelled out, what is absent left out."""
-    return tomli_w.dumps(_plain(dataclasses.asdict(config)))
+    """The resolved configuration as TOML: every default spelled out, what is absent by default left out."""
+    return tomli_w.dumps(_plain(config))
+
+
+def flat(config: Config) -> list[str]:
+    """The resolved configuration as lines `key = value`, one for each value that isn't a table."""
+
+    def lines(key: str, value: Any) -> Iterator[str]:
+        if isinstance(value, dict):
+            for name, below in value.items():
+                yield from lines(f"{key}.{name}" if key else name, below)
+        elif isinstance(value, list) and any(isinstance(below, dict) for below in value):
+            for index, below in enumerate(value):
+                yield from lines(f"{key}[{index}]", below)
+        else:
+            yield f"{key} = {value!r}"
+
+    return list(lines("", _plain(config)))
 
 
 def _first_problem(error: Exception, where: str) -> str | None:
@@ -175,7 +201,7 @@ def _strict(kind: type, accepted: tuple[type, ...], words: str) -> Callable[[Any
 
 def _literal(value: Any, kind: Any) -> Any:
     choices = get_args(kind)
-    if value not in choices:
+    if not any(type(value) is type(choice) and value == choice for choice in choices):
         raise ValueError(f"{value!r} must be one of {', '.join(map(repr, choices))}")
     return value
 
@@ -192,14 +218,21 @@ def _prism(value: Any, _: Any) -> Prism | None:
         return None
     if not isinstance(value, dict):
         raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
-    return _structure_prism(value, Prism)
+    return converter.structure(value, Prism)
 
 
 def _sequence_of(hook: Callable[[Any, Any], Any]) -> Callable[[Any, Any], tuple[Any, ...]]:
     def structure_all(value: Any, _: Any) -> tuple[Any, ...]:
         if not isinstance(value, list | tuple):
             raise TypeError(f"{value!r} must be an array")
-        return tuple(hook(v, None) for v in value)
+        return tuple(element(v, i) for i, v in enumerate(value))
+
+    def element(value: Any, index: int) -> Any:
+        try:
+            return hook(value, None)
+        except Exception as error:
+            error.add_note(IterableValidationNote(f"element {index}", index, None))
+            raise IterableValidationError("an array's element", [error], tuple) from error
 
     return structure_all
 
@@ -221,8 +254,40 @@ def _scale(value: Any, _: Any) -> float | str:
     return value if value == "background" else _number(value, float)
 
 
+def _table(kind: type) -> Callable[[Any, Any], Any]:
+    fields = make_dict_structure_fn(
+        kind, converter, **{k: override(struct_hook=h) for k, h in _hooks.get(kind, {}).items()}
+    )
+
+    def hook(value: Any, _: Any) -> Any:
+        if not isinstance(value, dict):
+            raise TypeError(f"{value!r} must be a table")
+        return fields(value, kind)
+
+    return hook
+
+
+def _free_table(value: Any, _: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError(f"{value!r} must be a table")
+    return value
+
+
+def _is_optional(kind: Any) -> bool:
+    return get_origin(kind) in (Union, UnionType) and len(get_args(kind)) == 2 and type(None) in get_args(kind)
+
+
+def _optional(value: Any, kind: Any) -> Any:
+    if value is None or value == NONE:
+        return None
+    return converter.structure(value, next(k for k in get_args(kind) if k is not type(None)))
+
+
 def _plain(value: Any) -> Any:
-    """What TOML can hold: None left out of tables, tensors as arrays, a missing prism by its name."""
+    """What TOML can hold: None left out where it is the default, tensors as arrays, a missing prism by its name."""
+    if dataclasses.is_dataclass(value):
+        values = {f.name: (getattr(value, f.name), f.default) for f in dataclasses.fields(value)}
+        return {k: NONE if v is None else _plain(v) for k, (v, usual) in values.items() if not (v is usual is None)}
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
@@ -244,19 +309,13 @@ converter.register_structure_hook_func(lambda kind: get_origin(kind) is Literal,
 converter.register_structure_hook_func(
     lambda kind: get_origin(kind) is tuple and Ellipsis not in get_args(kind), _tuple
 )
-_structure_prism = make_dict_structure_fn(
-    Prism,
-    converter,
-    shear=override(struct_hook=lambda value, _: _tuple(value, tuple[float, float])),
-    bias=override(struct_hook=_number),
-)
-for _cls, _hooks in {
+converter.register_structure_hook_func(_is_optional, _optional)
+converter.register_structure_hook_func(lambda kind: get_origin(kind) is dict, _free_table)
+_hooks: dict[type, dict[str, Callable[[Any, Any], Any]]] = {
+    Prism: {"shear": lambda value, _: _tuple(value, tuple[float, float]), "bias": _number},
     Objective: {"aberrations": _aberrations},
     Condenser: {"points": _tensor, "weights": _tensor},
     Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},
     DataSection: {"scale": _scale},
-}.items():
-    converter.register_structure_hook(
-        _cls,
-        make_dict_structure_fn(_cls, converter, **{k: override(struct_hook=h) for k, h in _hooks.items()}),
-    )
+}
+converter.register_structure_hook_factory(dataclasses.is_dataclass, _table)

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from recon import checkpoint, figures
 from recon.checkpoint import Checkpoint, CheckpointError, Row
-from recon.config import Config, ConfigError, dump
+from recon.config import Config, ConfigError, dump, flat
 from recon.descend import Step, descend
 from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
@@ -73,7 +73,7 @@ def reconstruct(
     """
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
-    identity = dump(config) + f"data sha256 {hashlib.sha256(measured.data.tobytes()).hexdigest()}\n"
+    identity = "\n".join([*flat(config), f"data's sha256 = {hashlib.sha256(measured.data.tobytes()).hexdigest()}"])
     saved = out / CHECKPOINT
     start: Checkpoint | None = None
     if saved.exists():
@@ -131,7 +131,7 @@ def _descend(
     with _log(out / "log.csv", rows) as log, tqdm(total=section.steps, initial=len(rows), unit="step") as bar:
         try:
             for step in steps:
-                rows.append((step.number, step.misfit, step.loss, step.seconds))
+                rows.append(_row(step))
                 log.writerow(rows[-1])
                 bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
                 bar.update()
@@ -140,12 +140,18 @@ def _descend(
         except KeyboardInterrupt:
             if step is None:
                 raise InterruptedRunError("interrupted before the first step") from None
+            if len(rows) < step.number:  # the signal came between the step and its row
+                rows.append(_row(step))
             checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
             raise InterruptedRunError(
                 f"interrupted after step {step.number} of {section.steps}; go on with --resume"
             ) from None
     assert step is not None
     return step, rows
+
+
+def _row(step: Step) -> Row:
+    return step.number, step.misfit, step.loss, step.seconds
 
 
 @contextmanager
