@@ -122,6 +122,8 @@ def _simulate(options: argparse.Namespace) -> None:
 def _reconstruct(options: argparse.Namespace) -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     config = load(options.config)
+    if config.data is None:
+        raise ConfigError(f"{options.config}: missing key data.path: a reconstruction needs a stack")
     result = reconstruct(config, options.out, options.device, resume=options.resume, restart=options.restart)
     delta: Any = result.metrics["delta"]
     print(
@@ -153,8 +155,15 @@ def _counts(shape: Sequence[int]) -> str:
     return f"{shape[0]} prism settings × {shape[1]} focus planes × {shape[2]} × {shape[3]} pixels"
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as all others are."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="torchdic",
         description="Simulate DIC images, and reconstruct the refractive-index volume behind them.",
     )
@@ -184,9 +193,11 @@ def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
-        return torch.zeros(1, device=name).device
+        tensor = torch.zeros(1, device=name)
+        tensor.item()  # a meta tensor holds nothing
     except (RuntimeError, AssertionError) as error:
         raise argparse.ArgumentTypeError(f"{name!r} is no device here: {str(error).splitlines()[0]}") from error
+    return tensor.device
 
 
 def _interrupt(_number: int, _frame: object) -> NoReturn:
