@@ -168,13 +168,13 @@ def _parser() -> argparse.ArgumentParser:
         description="Simulate DIC images, and reconstruct the refractive-index volume behind them.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    out = argparse.ArgumentParser(add_help=False)
+    out = _Parser(add_help=False)
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    device = argparse.ArgumentParser(add_help=False)
+    device = _Parser(add_help=False)
     device.add_argument(
         "--device", type=_device, default="auto", help="cpu, cuda, … (default: a GPU where there is one)"
     )
-    config = argparse.ArgumentParser(add_help=False)
+    config = _Parser(add_help=False)
     config.add_argument("config", type=Path, metavar="CONFIG.toml")
 
     demo = commands.add_parser("demo", parents=[out], help="a bead: truth beside three reconstructions")

@@ -255,9 +255,8 @@ def _scale(value: Any, _: Any) -> float | str:
 
 
 def _table(kind: type) -> Callable[[Any, Any], Any]:
-    fields = make_dict_structure_fn(
-        kind, converter, **{k: override(struct_hook=h) for k, h in _hooks.get(kind, {}).items()}
-    )
+    own: dict[str, Any] = {key: override(struct_hook=hook) for key, hook in _hooks.get(kind, {}).items()}
+    fields = make_dict_structure_fn(kind, converter, **own)
 
     def hook(value: Any, _: Any) -> Any:
         if not isinstance(value, dict):
