@@ -28,7 +28,7 @@ class Condenser:
             if self.weights is not None:
                 raise ValueError("condenser weights need the points that they belong to")
             return
-        points = torch.as_tensor(self.points)
+        points = torch.as_tensor(self.points, dtype=None if isinstance(self.points, Tensor) else torch.float64)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
             raise ValueError(f"condenser points have shape {tuple(points.shape)}, not (source, 2)")
         if not bool(torch.isfinite(points).all()):

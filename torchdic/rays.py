@@ -129,7 +129,9 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
             return torch.stack(change)
 
         ends = torch.tensor((z0, z1), dtype=state.dtype, device=state.device)
-        return odeint(slope, state, ends, **_solver_options(fidelity, steps))[-1]
+        path = odeint(slope, state, ends, **_solver_options(fidelity, steps))
+        assert isinstance(path, Tensor)
+        return path[-1]
 
     state = torch.zeros_like(y0 + py0).expand(4 + len(fields), *torch.broadcast_shapes(y0.shape, py0.shape))
     steps = fidelity.steps or grid.shape[0]

@@ -34,7 +34,8 @@ class SliceSampler:
         interpolation: Interpolation,
         first: int = 0,
     ) -> None:
-        self.grid, self.slices, self.interpolation, self.first = grid, slices, interpolation, first
+        self.grid, self.slices, self.first = grid, slices, first
+        self.interpolation: Interpolation = interpolation
 
     def sample(
         self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
@@ -97,7 +98,7 @@ def spline_coefficients(field: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]
             for neighbour in (i - 1, i + 1):
                 matrix[i, _mirror(neighbour, n - 1)] += 1
         inverse = torch.linalg.inv(matrix / 6).to(field)
-        field = torch.tensordot(inverse, field, dims=([1], [axis])).movedim(0, axis)
+        field = torch.tensordot(inverse, field.movedim(axis, 0), dims=1).movedim(0, axis)
     return field
 
 
