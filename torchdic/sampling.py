@@ -120,7 +120,7 @@ def _sample_linear(channels: Tensor, iy: Tensor, ix: Tensor) -> Tensor:
     ny, nx = channels.shape[1:]
     normalised = torch.stack((ix * (2 / (nx - 1)) - 1, iy * (2 / (ny - 1)) - 1), -1).reshape(1, 1, -1, 2)
     sampled = F.grid_sample(channels[None], normalised, padding_mode="border", align_corners=True)
-    return sampled.reshape(-1, *iy.shape)
+    return sampled.reshape(len(channels), *iy.shape)
 
 
 def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -138,7 +138,8 @@ def _spline_taps(index: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """The four neighbours of a fractional index along an axis of n, with their weights and slopes."""
     # clamp's gradient is 0 outside, and so is the mirrored spline's slope at its ends
     along = index.clamp(0, n - 1)
-    base = along.detach().floor().clamp(max=max(n - 2, 0))
+    # a ray that can't go on is nan, which no index can be: its weights stay nan
+    base = along.detach().floor().clamp(max=max(n - 2, 0)).nan_to_num()
     t = along - base
     weights = torch.stack(((1 - t) ** 3, 4 + t * t * (3 * t - 6), 1 + 3 * t * (1 + t - t * t), t**3), -1) / 6
     slopes = torch.stack((-((1 - t) ** 2), t * (3 * t - 4), 1 + t * (2 - 3 * t), t * t), -1) / 2
