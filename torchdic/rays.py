@@ -129,7 +129,7 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
             return torch.stack(change)
 
         ends = torch.tensor((z0, z1), dtype=state.dtype, device=state.device)
-        path = odeint(slope, state, ends, **_solver_options(fidelity, steps))
+        path = odeint(slope, state, ends, **_solver_options(fidelity, steps, grid.spacing[0]))
         assert isinstance(path, Tensor)
         return path[-1]
 
@@ -155,14 +155,15 @@ def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:
     return per_step * (fidelity.steps or grid.shape[0])
 
 
-def _solver_options(fidelity: Fidelity, steps: int) -> dict:
+def _solver_options(fidelity: Fidelity, steps: int, slice_: float) -> dict:
     if fidelity.solver in ADAPTIVE:
-        # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones
+        # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after
+        # an empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume
         return {
             "method": fidelity.solver,
             "rtol": fidelity.tolerance,
             "atol": fidelity.tolerance,
-            "options": {"norm": _largest},
+            "options": {"norm": _largest, "max_step": slice_},
         }
 
     def equal_steps(_function: object, _state: object, ends: Tensor) -> Tensor:
@@ -172,4 +173,5 @@ def _solver_options(fidelity: Fidelity, steps: int) -> dict:
 
 
 def _largest(state: Tensor) -> Tensor:
-    return state.abs().max()
+    # a ray that can't go on is nan, and no shorter step would help it
+    return state.abs().nan_to_num(nan=0.0).max()
