@@ -3,8 +3,8 @@
     python experiments/measured.py IMAGE.tif --out DIR
 
 Without IMAGE it takes the one that measured.toml names, from the folder in the environment variable TORCHDIC_DATA.
-The optics in measured.toml are guesses, so the phase has an arbitrary scale, and since shear and bias reversed together
-give the same image, an arbitrary sign. What the image shows, and this finds, is where the phase is and how it is shaped.
+The optics in measured.toml are guesses, so the phase has an arbitrary scale, and since shear and bias reversed
+together give the same image, an arbitrary sign. What the image shows, and this finds, is where the phase is and how it is shaped.
 """
 
 import argparse
@@ -86,7 +86,7 @@ def draw(image, flattened, phase, axis: ShearAxis) -> Figure:
         ax.set_title(title, fontsize=10)
     figure.colorbar(shown, ax=axes[2], label="arbitrary unit", ticks=[])
     ny, nx = image.shape
-    dy, dx = (0.08 * nx * d for d in axis.direction)
+    dy, dx = (0.06 * nx * d for d in axis.direction)
     axes[1].annotate(
         "",
         (0.12 * nx + dx, 0.15 * ny + dy),

@@ -30,24 +30,28 @@ class Bounds:
 
     def delta(self, parameter: Tensor) -> Tensor:
         """Δn of a free parameter."""
-        if self.lower is None and self.upper is None:
-            return parameter
-        if self.upper is None:
-            return self.lower + F.softplus(parameter, beta=SHARPNESS)
-        if self.lower is None:
-            return self.upper - F.softplus(-parameter, beta=SHARPNESS)
-        return self.lower + (self.upper - self.lower) * torch.sigmoid(4 * parameter / (self.upper - self.lower))
+        lower, upper = self.lower, self.upper
+        if lower is not None and upper is not None:
+            return lower + (upper - lower) * torch.sigmoid(4 * parameter / (upper - lower))
+        if lower is not None:
+            return lower + F.softplus(parameter, beta=SHARPNESS)
+        if upper is not None:
+            return upper - F.softplus(-parameter, beta=SHARPNESS)
+        return parameter
 
     def parameter(self, delta: Tensor, margin: float) -> Tensor:
         """The parameter whose Δn is the given one, kept `margin` away from the bounds so that it can still move."""
-        if self.lower is None and self.upper is None:
-            return delta.clone()
-        if self.upper is None:
-            above = (delta - self.lower).clamp_min(margin)
-            return above + torch.log(-torch.expm1(-SHARPNESS * above)) / SHARPNESS
-        if self.lower is None:
-            below = (self.upper - delta).clamp_min(margin)
-            return -(below + torch.log(-torch.expm1(-SHARPNESS * below)) / SHARPNESS)
-        width = self.upper - self.lower
-        share = ((delta - self.lower) / width).clamp(margin / width, 1 - margin / width)
-        return width / 4 * torch.logit(share)
+        lower, upper = self.lower, self.upper
+        if lower is not None and upper is not None:
+            margin = min(margin, (upper - lower) / 4)
+            share = (delta.clamp(lower + margin, upper - margin) - lower) / (upper - lower)
+            return (upper - lower) / 4 * torch.logit(share)
+        if lower is not None:
+            return _inverse_softplus((delta - lower).clamp_min(margin))
+        if upper is not None:
+            return -_inverse_softplus((upper - delta).clamp_min(margin))
+        return delta.clone()
+
+
+def _inverse_softplus(value: Tensor) -> Tensor:
+    return value + torch.log(-torch.expm1(-SHARPNESS * value)) / SHARPNESS

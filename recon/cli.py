@@ -18,9 +18,10 @@ from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
 from recon.config import Config, ConfigError, load, structure
 from recon.descend import Recipe
-from recon.reconstruct import InterruptedRunError, prepare_folder, reconstruct
+from recon.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
 from recon.simulate import exact_images
 from torchdic import (
+    STANDARD,
     Acquisition,
     Condenser,
     Fidelity,
@@ -76,7 +77,7 @@ def _demo(options: argparse.Namespace) -> None:
     contenders = [
         (Fidelity("projection"), Recipe(steps=60)),
         (Fidelity("rays", sources=16, steps=10), Recipe(steps=40)),
-        (Fidelity("wave", order=1), Recipe(steps=120)),
+        (RECOMMENDED, Recipe()),
     ]
     trials = compare(
         data,
@@ -97,6 +98,7 @@ def _simulate(options: argparse.Namespace) -> None:
     config = load(options.config)
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
+    fidelity = config.fidelity or STANDARD
     if specimen.background != config.volume.background:
         raise ConfigError(
             f"{options.config}: specimen.background {specimen.background} differs from volume.background "
@@ -106,11 +108,11 @@ def _simulate(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     prepare_folder(options.out)
     if config.simulation.exact:
-        images = exact_images(specimen, grid, microscope, acquisition, config.fidelity)
+        images = exact_images(specimen, grid, microscope, acquisition, fidelity)
     else:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-            images = image(Volume(grid, delta, specimen.background), microscope, acquisition, config.fidelity).cpu()
+            images = image(Volume(grid, delta, specimen.background), microscope, acquisition, fidelity).cpu()
     if microscope.camera is not None:
         images = microscope.camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
     focus = [float(f) for f in acquisition.focus]

@@ -23,7 +23,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.descend import Recipe
-from torchdic import STANDARD, Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 from torchdic.microscope import check_apertures
 
 T = TypeVar("T")
@@ -98,13 +98,16 @@ class SimulationSection:
 
 @dataclass(frozen=True, eq=False)
 class Config:
-    """All sections of a configuration file; `specimen` is left to `data_synthetic`, which knows its kinds."""
+    """All sections of a configuration file.
+
+    fidelity: None leaves it to the command. specimen: left to `data_synthetic`, which knows its kinds.
+    """
 
     volume: VolumeSection
     microscope: Microscope
     acquisition: Acquisition
     data: DataSection | None = None
-    fidelity: Fidelity = STANDARD
+    fidelity: Fidelity | None = None
     reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None

@@ -100,7 +100,7 @@ def descend(
     parameter.requires_grad_(True)
     adam = torch.optim.Adam([parameter], lr=recipe.learning_rate)
     if resume is not None:
-        adam.load_state_dict(resume.optimiser)
+        adam.load_state_dict(copy.deepcopy(resume.optimiser))  # Adam works in place
 
     for number in range(first, recipe.steps):
         adam.param_groups[0]["lr"] = cosine(number, recipe.steps, recipe.learning_rate)
@@ -117,8 +117,7 @@ def descend(
         loss.backward()
         adam.step()
         misfit, loss = float(misfit.detach()), float(loss.detach())
-        with torch.no_grad():
-            delta = recipe.bounds.delta(parameter)
+        delta = recipe.bounds.delta(parameter.detach().clone())
         if not math.isfinite(loss) or not bool(torch.isfinite(delta).all()):
             raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {loss:g}")
         lowest = background + float(delta.min())

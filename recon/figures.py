@@ -27,12 +27,13 @@ def draw_images(
     measured: Float[Tensor, "prism focus y x"],
     modelled: Float[Tensor, "prism focus y x"],
     prisms: Sequence[Prism | None],
-    focus: Sequence[float],
+    focus: Sequence[float | Tensor],
     grid: Grid,
 ) -> Figure:
     """Measured, modelled and residual images, a row for each prism at its middle focus plane."""
     planes = sorted({len(focus) // 4, len(focus) // 2, (3 * len(focus)) // 4})
-    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * len(prisms) + 0.7), layout="constrained")
+    aspect = grid.extent[1] / grid.extent[2]
+    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
     axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
     residual = measured - modelled
     largest = float(residual[:, planes].abs().max())
@@ -100,12 +101,13 @@ def draw_misfit(rows: Sequence[Row]) -> Figure:
 def draw_stack(
     stack: Float[Tensor, "prism focus y x"],
     prisms: Sequence[Prism | None],
-    focus: Sequence[float],
+    focus: Sequence[float | Tensor],
     spacing: tuple[float, float],
 ) -> Figure:
     """A stack's images, a row for each prism; at most seven focus planes, evenly chosen."""
     planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), 7)).round().astype(int))
-    figure = Figure(figsize=(1.9 * len(planes) + 0.6, 1.9 * len(prisms) + 0.5), layout="constrained")
+    aspect = stack.shape[2] * spacing[0] / (stack.shape[3] * spacing[1])
+    figure = Figure(figsize=(1.9 * len(planes) + 0.6, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
     for p, prism in enumerate(prisms):
         limits = float(stack[p].min()), float(stack[p].max())

@@ -5,8 +5,9 @@ import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -20,11 +21,13 @@ from recon.descend import Step, descend
 from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
 from recon.misfit import gaussian, spatial_variance
-from torchdic import Volume, image
+from torchdic import Fidelity, Volume, image
 from torchdic.files import written_whole
 from torchdic.tiff import StackError, read_stack, write_volume
 
 CHECKPOINT = "checkpoint.pt"
+# Without a [fidelity] section: what a first-order split step lacks is below what condenser directions and voxels leave.
+RECOMMENDED = Fidelity("wave", order=1)
 
 
 class InterruptedRunError(Exception):
@@ -71,6 +74,8 @@ def reconstruct(
     Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; InterruptedRunError on
     Ctrl-C, with a checkpoint saved.
     """
+    fidelity = config.fidelity or RECOMMENDED
+    config = replace(config, fidelity=fidelity)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
     identity = "\n".join([*flat(config), f"data's sha256 = {hashlib.sha256(measured.data.tobytes()).hexdigest()}"])
@@ -84,13 +89,13 @@ def reconstruct(
     prepare_folder(out)
     _write_text(out / "config.toml", dump(config))
 
-    last, rows = _descend(config, data, out, identity, start)
+    last, rows = _descend(config, fidelity, data, out, identity, start)
     grid = config.volume.grid
     with torch.no_grad():
         volume = Volume(grid, last.delta, config.volume.background)
-        modelled = image(volume, config.microscope, config.acquisition, config.fidelity).cpu()
+        modelled = image(volume, config.microscope, config.acquisition, fidelity).cpu()
     data, delta = data.cpu(), last.delta.cpu()
-    metrics = _metrics(config, measured, modelled, data, delta, last)
+    metrics = {"propagation": fidelity.propagation, **_metrics(measured, modelled, data, delta, last)}
     write_volume(out / "volume.ome.tif", delta, grid)
     _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     prisms, focus = config.acquisition.prisms, measured.focus
@@ -113,7 +118,7 @@ def prepare_folder(out: Path) -> None:
 
 
 def _descend(
-    config: Config, data: Tensor, out: Path, identity: str, start: Checkpoint | None
+    config: Config, fidelity: Fidelity, data: Tensor, out: Path, identity: str, start: Checkpoint | None
 ) -> tuple[Step, list[Row]]:
     section = config.reconstruction
     rows = [] if start is None else list(start.rows)
@@ -124,7 +129,7 @@ def _descend(
         config.volume.background,
         config.microscope,
         config.acquisition,
-        config.fidelity,
+        fidelity,
         section,
         step,
     )
@@ -155,7 +160,7 @@ def _row(step: Step) -> Row:
 
 
 @contextmanager
-def _log(path: Path, rows: list[Row]) -> Iterator["csv.Writer"]:
+def _log(path: Path, rows: list[Row]) -> Iterator[Any]:
     """log.csv open for further rows, the earlier ones in it already."""
     with path.open("w", newline="", encoding="utf-8", buffering=1) as file:
         writer = csv.writer(file)
@@ -169,9 +174,7 @@ def _write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def _metrics(
-    config: Config, measured: Measured, modelled: Tensor, data: Tensor, delta: Tensor, last: Step
-) -> dict[str, object]:
+def _metrics(measured: Measured, modelled: Tensor, data: Tensor, delta: Tensor, last: Step) -> dict[str, object]:
     variance = spatial_variance(data)
     noise = [report.noise for report in measured.prisms]
     floor = None
@@ -183,7 +186,6 @@ def _metrics(
         "residual_rms": residual_rms(modelled, data),
         "steps": last.number,
         "seconds": round(last.seconds, 3),
-        "propagation": config.fidelity.propagation,
         "delta": {"min": float(delta.min()), "max": float(delta.max()), "mean": float(delta.mean())},
         "prisms": [asdict(report) for report in measured.prisms],
     }
