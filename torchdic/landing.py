@@ -42,7 +42,9 @@ def ray_field(
 
     with torch.no_grad():
         source, triangle, pixel = mesh.covered(landed.position)
-        caustic = _caustic_phase(mesh.edges(leaving.position), mesh.edges(landed.position))[source, triangle]
+        ahead = plane > grid.extent[0] / 2
+        caustics = _caustic_phase(mesh.edges(leaving.position), mesh.edges(landed.position), forward=ahead)
+        caustic = caustics[source, triangle]
 
     def corners(values: Tensor) -> Tensor:
         return mesh.flat(values)[source[:, None], mesh.triangles[triangle]]
@@ -156,10 +158,10 @@ class _Mesh:
         return source[inside], triangle[inside], pixel[inside]
 
 
-def _caustic_phase(leaving: Tensor, landed: Tensor) -> Tensor:
+def _caustic_phase(leaving: Tensor, landed: Tensor, *, forward: bool = False) -> Tensor:
     """−π/2 for a caustic crossed on the way to the exit, +π/2 for each crossed on the way back to the reference plane.
 
-    Both meshes are given by two edges of each triangle, (source, triangle, 2, 2).
+    forward: the plane lies behind the exit, and its caustics cost −π/2 too. Both meshes are given by two edges of each triangle, (source, triangle, 2, 2).
     """
     start, stop = _cross(*leaving.unbind(2)), _cross(*landed.unbind(2))
     # the area on the way is a parabola in the fraction s of the way: start + slope·s + bend·s²
@@ -168,9 +170,10 @@ def _caustic_phase(leaving: Tensor, landed: Tensor) -> Tensor:
     slope = stop - start - bend
     turning = torch.where(bend == 0, torch.inf, -slope / (2 * bend))
     lowest = start + slope * turning / 2
-    twice = (start * stop > 0) & (turning > 0) & (turning < 1) & (lowest * start < 0)
-    back = (start * stop < 0).to(start) + 2 * twice.to(start)
-    return (math.pi / 2) * (back - (start < 0).to(start))
+    # rays are normals of a wavefront, so the parabola's zeros are real; at a symmetric focus they are one
+    twice = (start * stop > 0) & (turning > 0) & (turning < 1) & (lowest * start < 1e-4 * start.square())
+    crossed = (start * stop < 0).to(start) + 2 * twice.to(start)
+    return (math.pi / 2) * ((-crossed if forward else crossed) - (start < 0).to(start))
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
