@@ -26,7 +26,7 @@ lint: $(INSTALLED)
 	$(BIN)/pyright
 
 bench: $(INSTALLED)
-	$(BIN)/python benchmarks/exact_sphere.py
+	$(BIN)/python benchmarks/references.py
 
 clean:
 	rm -rf $(VENV) demo .pytest_cache .ruff_cache
