@@ -1,0 +1,389 @@
+import dataclasses
+import math
+import tomllib
+from pathlib import Path
+
+import pytest
+import tomli_w
+import torch
+
+from recon.bounds import Bounds
+from recon.config import Config, ConfigError, VolumeSection, dump, flat, load
+from recon.descend import Recipe
+from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
+
+CONTRACT = """
+[volume]                       # the reconstruction's grid
+shape = [20, 64, 64]           # (z, y, x) voxels
+spacing = [0.4, 0.2, 0.2]      # µm
+background = 1.56
+[microscope]
+wavelength = 0.546
+objective = { na = 0.9 }
+condenser = { na = 0.7 }
+[acquisition]
+focus = [-4.0, -3.0, -2.0]     # µm
+prisms = [{ shear = [0.0, 0.24], bias = 1.5708 }, { shear = [0.24, 0.0], bias = -1.5708 }]
+[data]
+path = "stack.ome.tif"         # (prism, focus, y, x), (focus, y, x) or (y, x); pixels as the volume's
+"""
+
+EVERYTHING = (
+    CONTRACT
+    + """
+scale = "background"
+flatten = true
+offset = 100
+order = 1
+[microscope.camera]
+photons = 5000
+read_noise = 2.5
+[fidelity]
+propagation = "rays"
+steps = 7
+sources = 12
+reference_plane = 0.5
+[reconstruction]
+steps = 40
+learning_rate = 1e-3
+tv = [50, 5.0]
+l1 = 0
+start = "zero"
+draft_sources = "none"
+checkpoint_every = 3
+bounds = { lower = "none", upper = 0.1 }
+[simulation]
+seed = 7
+exact = true
+[specimen]
+kind = "bead"
+radius = 2.5
+contrast = 0.03
+"""
+)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function from TOML to the path of a file that holds it."""
+
+    def put(text):
+        path = tmp_path / "config.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return put
+
+
+def changed(key, value):
+    """The contract's example with one value changed, as TOML; `...` takes the key away."""
+    values = tomllib.loads(CONTRACT)
+    *folders, last = (int(part) if part.isdigit() else part for part in key.split("."))
+    place = values
+    for part in folders:
+        place = place[part] if isinstance(place, list) else place.setdefault(part, {})
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    return tomli_w.dumps(values)
+
+
+def the_error(path):
+    """The one line with which a file is refused; it begins with the file."""
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def equal(a, b):
+    """Whether two configurations hold the same, tensors included."""
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[k], b[k]) for k in a)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(equal(x, y) for x, y in zip(a, b, strict=True))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b and type(a) is type(b)
+
+
+# what a file says
+
+
+def test_the_contracts_example_loads_as_written(write):
+    path = write(CONTRACT)
+    config = load(path)
+    assert config.volume.grid.shape == (20, 64, 64)
+    assert config.volume.grid.spacing == (0.4, 0.2, 0.2)
+    assert config.volume.background == 1.56
+    assert config.microscope.wavelength == 0.546
+    assert config.microscope.objective.na == 0.9
+    assert config.microscope.condenser.na == 0.7
+    assert config.acquisition.focus == (-4.0, -3.0, -2.0)
+    assert [(p.shear, p.bias) for p in config.acquisition.prisms] == [((0.0, 0.24), 1.5708), ((0.24, 0.0), -1.5708)]
+    assert Path(config.data.path) == path.parent / "stack.ome.tif"
+
+
+def test_what_a_file_does_not_say_is_absent_or_recommended(write):
+    config = load(write(CONTRACT))
+    assert config.fidelity is None  # each command has its own
+    assert dataclasses.asdict(config.reconstruction).items() >= dataclasses.asdict(Recipe()).items()
+    assert config.microscope.camera is None
+    assert config.microscope.objective.aberrations is None
+    assert config.specimen is None
+    assert config.data.scale is None
+    assert config.data.flatten is None
+
+
+def test_every_section_is_read(write):
+    config = load(write(EVERYTHING))
+    assert config.fidelity == Fidelity("rays", steps=7, sources=12, reference_plane=0.5)
+    recipe = config.reconstruction
+    assert (recipe.steps, recipe.learning_rate, recipe.tv, recipe.l1) == (40, 1e-3, (50.0, 5.0), 0.0)
+    assert (recipe.start, recipe.draft_sources, recipe.checkpoint_every) == ("zero", None, 3)
+    assert recipe.bounds == Bounds(None, 0.1)
+    assert (config.microscope.camera.photons, config.microscope.camera.read_noise) == (5000, 2.5)
+    assert (config.data.scale, config.data.flatten, config.data.offset, config.data.order) == (
+        "background",
+        True,
+        100,
+        1,
+    )
+    assert (config.simulation.seed, config.simulation.exact) == (7, True)
+    assert config.specimen == {"kind": "bead", "radius": 2.5, "contrast": 0.03}
+
+
+def test_a_whole_number_serves_as_a_float(write):
+    config = load(write(CONTRACT.replace("background = 1.56", "background = 2").replace("-4.0,", "-4,")))
+    assert config.volume.background == 2.0
+    assert isinstance(config.volume.background, float)
+    assert isinstance(config.acquisition.focus[0], float)
+
+
+def test_bright_field_is_a_prism_by_its_name(write):
+    config = load(write(changed("acquisition.prisms", ["brightfield", {"shear": [0.0, 0.2], "bias": 0.5}])))
+    assert config.acquisition.prisms[0] is None
+    assert config.acquisition.prisms[1].bias == 0.5
+
+
+def test_points_weights_and_aberrations_are_read(write):
+    text = changed("microscope.condenser", {"na": 0.5, "points": [[0.0, 0.1], [0.2, 0.0]], "weights": [1, 3]})
+    config = load(
+        write(text.replace("[microscope.objective]\n", '[microscope.objective]\naberrations = { "11" = 0.2 }\n'))
+    )
+    assert config.microscope.condenser.points.tolist() == [[0.0, 0.1], [0.2, 0.0]]
+    assert config.microscope.condenser.weights.tolist() == [1.0, 3.0]
+    assert config.microscope.objective.aberrations == {11: 0.2}
+
+
+def test_relative_data_paths_start_at_the_files_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "deep" / "er"
+    folder.mkdir(parents=True)
+    (folder / "config.toml").write_text(CONTRACT.replace('"stack.ome.tif"', '"../stack.ome.tif"'), encoding="utf-8")
+    for place, name in ((tmp_path, "deep/er/config.toml"), (folder, "config.toml"), (folder.parent, "er/config.toml")):
+        monkeypatch.chdir(place)
+        assert Path(load(name).data.path) == tmp_path / "deep" / "stack.ome.tif"
+
+
+def test_absolute_data_paths_stay(write, tmp_path):
+    elsewhere = tmp_path / "elsewhere" / "stack.tif"
+    assert load(write(changed("data.path", str(elsewhere)))).data.path == str(elsewhere)
+
+
+# what is resolved
+
+
+@pytest.mark.parametrize("text", [CONTRACT, EVERYTHING], ids=["contract", "everything"])
+def test_the_resolved_configuration_loads_to_the_same(write, tmp_path, text):
+    config = load(write(text))
+    (tmp_path / "elsewhere").mkdir()
+    resolved = tmp_path / "elsewhere" / "config.toml"
+    resolved.write_text(dump(config), encoding="utf-8")
+    assert equal(load(resolved), config)
+    assert dump(load(resolved)) == dump(config)
+
+
+def test_a_configuration_made_in_code_survives_its_file(tmp_path):
+    config = Config(
+        VolumeSection((3, 4, 5), (0.4, 0.2, 0.2), 1.33),
+        Microscope(
+            0.633,
+            Objective(0.9, {4: 0.1, 11: -0.2}),
+            Condenser(0.5, torch.tensor([[0.0, 0.1], [0.3, 0.2]], dtype=torch.float64)),
+        ),
+        Acquisition([None, Prism((0.1, 0.2), 1.0)], [0.5, 0.1]),
+    )
+    path = tmp_path / "config.toml"
+    path.write_text(dump(config), encoding="utf-8")
+    assert equal(load(path), config)
+
+
+def test_the_resolved_configuration_spells_every_default_out(write):
+    values = tomllib.loads(dump(load(write(CONTRACT))))
+    assert values["reconstruction"]["steps"] == Recipe().steps
+    assert values["simulation"] == {"seed": 0, "exact": False}
+    assert "specimen" not in values
+
+
+def test_flat_names_each_value_with_its_whole_key(write):
+    lines = flat(load(write(EVERYTHING)))
+    assert "volume.shape = [20, 64, 64]" in lines
+    assert "acquisition.prisms[1].shear = [0.24, 0.0]" in lines
+    assert "reconstruction.bounds.lower = 'none'" in lines
+    assert len({line.partition(" = ")[0] for line in lines}) == len(lines)
+    assert not any("\n" in line for line in lines)
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("volume.spcaing", 1, "unknown key volume.spcaing; did you mean 'spacing'?"),
+        ("microscope.wavelenght", 0.5, "unknown key microscope.wavelenght; did you mean 'wavelength'?"),
+        ("acquisition.prisms.1.bais", 1, "unknown key acquisition.prisms[1].bais; did you mean 'bias'?"),
+        ("reconstruction.learning_rte", 1, "unknown key reconstruction.learning_rte; did you mean 'learning_rate'?"),
+        ("reconstruction.bounds", {"lwer": 0}, "unknown key reconstruction.bounds.lwer; did you mean 'lower'?"),
+        ("camera", {}, "unknown key camera; known keys: volume, microscope, acquisition, data"),
+        ("microscope.wavelength", ..., "missing key microscope.wavelength"),
+        ("volume", ..., "missing key volume"),
+        ("acquisition.prisms.1.bias", ..., "missing key acquisition.prisms[1].bias"),
+        ("data.path", ..., "missing key data.path"),
+    ],
+)
+def test_a_key_that_is_unknown_or_missing_is_named(write, key, value, message):
+    assert the_error(write(changed(key, value))).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "law"),
+    [
+        ("volume", 3, "must be a table"),
+        ("microscope.objective", 0.9, "must be a table"),
+        ("specimen", "bead", "must be a table"),
+        ("reconstruction.bounds", [0, 1], "must be a table"),
+        ("volume.background", "1.5", "must be a number"),
+        ("volume.background", True, "must be a number"),
+        ("microscope.objective.na", [0.9], "must be a number"),
+        ("volume.shape", 6, "must be an array of 3 values"),
+        ("volume.shape", [6, 16], "must be an array of 3 values"),
+        ("reconstruction.tv", 10, "must be an array of 2 values"),
+        ("reconstruction.steps", 10.0, "must be a whole number"),
+        ("reconstruction.steps", True, "must be a whole number"),
+        ("fidelity.sources", "12", "must be a whole number"),
+        ("fidelity.propagation", "waves", "must be one of 'projection', 'rays', 'wave'"),
+        ("fidelity.order", True, "must be one of 1, 2"),
+        ("fidelity.order", 3, "must be one of 1, 2"),
+        ("reconstruction.start", "linaer", "must be one of 'linear', 'zero'"),
+        ("acquisition.focus", 1.0, "must be an array"),
+        ("acquisition.prisms", {"shear": [0, 1], "bias": 1}, "must be an array"),
+        ("data.path", 3, "must be a string"),
+        ("data.flatten", 1, "must be true or false"),
+        ("data.scale", "lamp", "must be a number"),
+        ("simulation.exact", "yes", "must be true or false"),
+        ("microscope.condenser.points", [["a", 0.1]], "must be an array of numbers"),
+        ("microscope.objective.aberrations", {"defocus": 0.1}, "must be a table of Noll indices"),
+    ],
+)
+def test_a_wrong_type_is_named_with_its_key_value_and_law(write, key, value, law):
+    message = the_error(write(changed(key, value)))
+    assert message.startswith(f"{key}: {value!r} {law}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named", "law"),
+    [
+        ("volume.shape.1", 16.5, "volume.shape: 16.5", "must be a whole number"),
+        ("volume.shape.0", True, "volume.shape: True", "must be a whole number"),
+        ("acquisition.focus.2", "top", "acquisition.focus[2]: 'top'", "must be a number"),
+        ("acquisition.focus.0", True, "acquisition.focus[0]: True", "must be a number"),
+        ("acquisition.prisms.1", "bright", "acquisition.prisms[1]: 'bright'", "or 'brightfield'"),
+        ("acquisition.prisms.0.shear", [0.2], "acquisition.prisms[0].shear: [0.2]", "an array of 2 values"),
+        ("acquisition.prisms.0.bias", "90°", "acquisition.prisms[0].bias: '90°'", "must be a number"),
+        ("microscope.objective.aberrations", {"4": "a"}, "microscope.objective.aberrations: 'a'", "must be a number"),
+    ],
+)
+def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, named, law):
+    message = the_error(write(changed(key, value)))
+    assert message.startswith(named)
+    assert law in message
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("microscope.wavelength", -0.546, ["microscope", "wavelength -0.546 µm", "above 0"]),
+        ("microscope.wavelength", math.nan, ["microscope", "wavelength nan", "above 0"]),
+        ("microscope.objective.na", 0, ["microscope.objective", "NA 0", "above 0"]),
+        ("microscope.objective.na", 1.6, ["objective NA 1.6", "exceeds", "index 1.56"]),
+        ("microscope.objective.na", math.nan, ["objective NA nan", "above 0"]),
+        ("microscope.condenser.na", 1.7, ["condenser NA 1.7", "exceeds", "index 1.56"]),
+        ("microscope.condenser.na", -0.1, ["condenser NA -0.1", "at least 0"]),
+        ("microscope.condenser.points", [[0, 2.0]], ["condenser", "2", "below", "index 1.56"]),
+        ("microscope.condenser.weights", [1.0], ["condenser weights", "points"]),
+        ("microscope.camera", {"photons": 0}, ["microscope.camera", "photons 0", "above 0"]),
+        ("microscope.camera", {"photons": math.nan}, ["microscope.camera", "photons nan", "above 0"]),
+        ("microscope.camera", {"photons": 10, "read_noise": -1}, ["read_noise -1", "at least 0"]),
+        ("microscope.camera", {"read_noise": 1}, ["read_noise 1", "photons"]),
+        ("microscope.objective.aberrations", {"0": 1.0}, ["aberration 0", "from 1"]),
+        ("microscope.objective.aberrations", {"4": math.nan}, ["aberration 4", "nan", "finite"]),
+        ("volume.shape", [0, 64, 64], ["volume", "shape (0, 64, 64)", "at least 1"]),
+        ("volume.spacing", [0.4, -0.2, 0.2], ["volume", "spacing (0.4, -0.2, 0.2)", "above 0"]),
+        ("volume.spacing", [0.4, 0.2, math.nan], ["volume", "spacing", "nan", "above 0"]),
+        ("volume.background", 0.5, ["volume", "background 0.5", "at least 1"]),
+        ("volume.background", math.nan, ["volume", "background nan", "at least 1"]),
+        ("volume.background", math.inf, ["volume", "background inf"]),
+        ("acquisition.prisms", [], ["acquisition", "at least one prism"]),
+        ("acquisition.focus", [], ["acquisition", "at least one", "focus"]),
+        ("acquisition.focus.1", math.nan, ["acquisition", "focus nan", "finite"]),
+        ("acquisition.prisms.1.bias", math.nan, ["acquisition.prisms[1]", "bias nan", "finite"]),
+        ("acquisition.prisms.0.shear", [0, math.inf], ["acquisition.prisms[0]", "shear x inf", "finite"]),
+        ("fidelity.sources", 0, ["fidelity", "sources 0", "at least 1"]),
+        ("fidelity.steps", 0, ["fidelity", "steps 0", "at least 1"]),
+        ("fidelity.padding", -1, ["fidelity", "padding -1", "at least 0"]),
+        ("reconstruction.steps", 0, ["reconstruction", "steps 0", "at least 1"]),
+        ("reconstruction.learning_rate", -1, ["reconstruction", "learning_rate -1", "above 0"]),
+        ("reconstruction.tv", [math.nan, 1], ["reconstruction", "tv nan", "at least 0"]),
+        ("reconstruction.checkpoint_every", 0, ["reconstruction", "checkpoint_every 0", "at least 1"]),
+        ("reconstruction.draft_sources", 0, ["reconstruction", "draft_sources 0", "at least 1"]),
+        ("reconstruction.bounds", {"lower": 1, "upper": 0.5}, ["reconstruction.bounds", "1.0", "below", "0.5"]),
+        ("reconstruction.bounds", {"lower": math.nan}, ["reconstruction.bounds", "nan", "finite"]),
+        ("data.scale", -1, ["data", "scale -1", "above 0"]),
+        ("data.offset", math.nan, ["data", "offset nan", "finite"]),
+        ("data.order", -1, ["data", "order -1", "at least 0"]),
+    ],
+)
+def test_an_unphysical_value_is_named_with_its_law(write, key, value, words):
+    message = the_error(write(changed(key, value)))
+    assert [word for word in words if word not in message] == []
+
+
+def test_an_unknown_key_is_told_before_what_it_left_missing(write):
+    text = CONTRACT.replace("wavelength", "wavelenght")
+    assert the_error(write(text)).startswith("unknown key microscope.wavelenght")
+
+
+@pytest.mark.parametrize("text", ["[volume\n", "shape = [1,\n", "[volume]\n[volume]\n", "a = 1\na = 2\n"])
+def test_bad_toml_is_told_with_its_line(write, text):
+    message = the_error(write(text))
+    assert "is not TOML" in message
+    assert "line " in message or "end of document" in message
+
+
+def test_a_file_that_is_not_utf_8_is_told(tmp_path):
+    path = tmp_path / "config.toml"
+    path.write_bytes(CONTRACT.encode("latin-1"))
+    assert the_error(path).startswith("is not TOML: 'utf-8' codec can't decode")
+
+
+def test_a_missing_file_and_a_folder_are_told(tmp_path):
+    assert the_error(tmp_path / "none.toml") == "No such file or directory"
+    assert the_error(tmp_path) == "Is a directory"
+
+
+def test_an_empty_file_misses_its_first_section(write):
+    assert the_error(write("")) == "missing key volume"

@@ -1,0 +1,357 @@
+import dataclasses
+import itertools
+import math
+
+import pytest
+import torch
+
+from data_synthetic import GaussianBall
+from recon import checkpoint
+from recon.bounds import Bounds
+from recon.checkpoint import Checkpoint, CheckpointError
+from recon.descend import Recipe, descend
+from recon.metrics import mean_inside, residual_rms, volume_error
+from recon.regularisers import total_variation
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+
+BACKGROUND = 1.5
+GRID = Grid((6, 16, 14), (0.5, 0.2, 0.2))
+MICROSCOPE = Microscope(0.546, Objective(0.8), Condenser(0.5))
+TWO_SHEARS = Acquisition([Prism((0.0, 0.24), 1.5), Prism((0.24, 0.0), -1.2)], [-1.0, 0.0, 1.0])
+FIDELITY = Fidelity(sources=6)
+RECIPE = Recipe(steps=12, tv=(20.0, 5.0))
+
+
+@pytest.fixture
+def truth():
+    """A ball off the centre along every axis."""
+    return GaussianBall(0.5, 0.02, BACKGROUND, (0.3, -0.5, 0.4)).delta(GRID, dtype=torch.float32)
+
+
+def seen(truth, acquisition=TWO_SHEARS, fidelity=FIDELITY):
+    with torch.no_grad():
+        return image(Volume(GRID, truth, BACKGROUND), MICROSCOPE, acquisition, fidelity)
+
+
+def run(data, recipe=RECIPE, acquisition=TWO_SHEARS, fidelity=FIDELITY, resume=None):
+    return list(descend(data, GRID, BACKGROUND, MICROSCOPE, acquisition, fidelity, recipe, resume))
+
+
+def same(a, b):
+    """Bit for bit, dicts and tensors alike."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def alike(a, b):
+    """Whether two steps are bit for bit the same, but for their seconds."""
+    names = [f.name for f in dataclasses.fields(a) if f.name != "seconds"]
+    return all(same(getattr(a, name), getattr(b, name)) for name in names)
+
+
+# the descent
+
+
+def test_the_misfit_falls_fiftyfold_and_the_error_with_it(truth):
+    steps = run(seen(truth), Recipe(steps=60, start="zero"))
+    assert steps[0].misfit > 0.5  # the volume before the first step is nearly empty
+    assert steps[-1].misfit < 0.02 * steps[0].misfit
+    errors = [volume_error(step.delta, truth) for step in steps]
+    assert errors[0] > 0.75
+    assert errors[-1] < 0.6  # these few planes leave the ball blurred along z
+    for axis in range(3):
+        assert volume_error(steps[-1].delta.flip(axis), truth) > errors[-1] + 0.2
+
+
+def test_the_linear_start_is_ahead_of_an_empty_one(truth):
+    linear, zero = (run(seen(truth), dataclasses.replace(RECIPE, start=s, steps=1))[0] for s in ("linear", "zero"))
+    assert linear.misfit < 0.3 * zero.misfit
+
+
+def test_each_propagation_descends_on_its_own_images(truth, propagation):
+    fidelity = Fidelity(propagation, sources=4)
+    steps = run(seen(truth, fidelity=fidelity), Recipe(steps=25, start="zero"), fidelity=fidelity)
+    assert steps[-1].misfit < 0.2 * steps[0].misfit
+    # the sum along z: where it lies along z, a projection leaves open
+    first, last = (volume_error(step.delta.sum(0), truth.sum(0)) for step in (steps[0], steps[-1]))
+    assert last < 0.5 * first
+    assert steps[-1].delta.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "acquisition",
+    [
+        Acquisition([Prism((0.1, 0.2), 1.5)], [0.0]),
+        Acquisition([None], [-1.0, 0.5]),
+        Acquisition([Prism((0.24, 0.0), -1.0), None], [0.5, -0.5]),
+        Acquisition([Prism((0.24, 0.0), -2.5), Prism((0.0, -0.24), -0.8)], [0.2]),
+    ],
+    ids=["one image", "bright field", "both", "negative bias"],
+)
+def test_any_acquisition_descends(truth, acquisition):
+    data = seen(truth, acquisition)
+    steps = run(data, dataclasses.replace(RECIPE, start="zero"), acquisition)
+    assert steps[-1].misfit < 0.6 * steps[0].misfit
+    assert float((steps[-1].delta * truth).sum()) > 0
+
+
+def test_steps_are_numbered_from_1_and_time_goes_on(truth):
+    steps = run(seen(truth))
+    assert [step.number for step in steps] == list(range(1, 13))
+    assert all(0 < a.seconds < b.seconds for a, b in itertools.pairwise(steps))
+
+
+@pytest.mark.parametrize("bounds", [Bounds(), Bounds(None, None), Bounds(-0.1, 0.1)], ids=["0", "none", "both"])
+def test_what_a_step_holds_does_not_change_any_more(truth, bounds):
+    recipe = dataclasses.replace(RECIPE, bounds=bounds)
+    steps, copies = [], []
+    for step in descend(seen(truth), GRID, BACKGROUND, MICROSCOPE, TWO_SHEARS, FIDELITY, recipe):
+        steps.append(step)
+        copies.append(
+            dataclasses.replace(
+                step,
+                delta=step.delta.clone(),
+                parameter=step.parameter.clone(),
+                optimiser={
+                    "state": {k: {n: t.clone() for n, t in v.items()} for k, v in step.optimiser["state"].items()},
+                    "param_groups": [dict(group) for group in step.optimiser["param_groups"]],
+                },
+            )
+        )
+    assert all(alike(step, copy) for step, copy in zip(steps, copies, strict=True))
+    assert not torch.equal(steps[0].delta, steps[1].delta)
+    assert not steps[-1].delta.requires_grad
+    assert not steps[-1].parameter.requires_grad
+
+
+def test_a_step_s_delta_is_its_parameters(truth):
+    step = run(seen(truth))[-1]
+    assert torch.equal(step.delta, RECIPE.bounds.delta(step.parameter))
+
+
+def test_delta_stays_within_its_bounds(truth):
+    recipe = dataclasses.replace(RECIPE, bounds=Bounds(-0.001, 0.01), learning_rate=0.05)
+    for step in run(seen(truth), recipe):
+        assert float(step.delta.min()) >= -0.001 - 1e-8
+        assert float(step.delta.max()) <= 0.01 + 1e-8
+
+
+@pytest.mark.parametrize(("bounds", "error"), [(Bounds(None, None), 0.75), (Bounds(None, 0.0), 0.55)])
+def test_a_negative_contrast_is_found_where_the_bounds_let_it(truth, bounds, error):
+    recipe = Recipe(steps=40, learning_rate=2e-3, tv=(10.0, 10.0), bounds=bounds)
+    assert volume_error(run(seen(-truth), recipe)[-1].delta, -truth) < error
+    assert volume_error(run(seen(-truth))[-1].delta, -truth) > 0.95  # the default ones do not
+
+
+def test_more_total_variation_leaves_less_of_it(truth):
+    data = seen(truth) + 0.01 * torch.randn(2, 3, 16, 14)
+    rough, smooth = (run(data, dataclasses.replace(RECIPE, tv=(w, w)))[-1].delta for w in (0.0, 100.0))
+    assert total_variation(smooth, GRID.spacing) < 0.5 * total_variation(rough, GRID.spacing)
+
+
+def test_l1_pulls_an_invisible_uniform_index_down(truth):
+    free, held = (run(seen(truth), dataclasses.replace(RECIPE, l1=w, steps=25))[-1].delta.mean() for w in (0.0, 100.0))
+    assert float(held) < 0.9 * float(free)
+
+
+def test_draft_sources_serve_the_first_60_percent_only(truth):
+    data = seen(truth)
+    recipe = dataclasses.replace(RECIPE, draft_sources=3)
+    drafted, few, all_ = run(data, recipe), run(data, recipe, fidelity=Fidelity(sources=3)), run(data)
+    # 12 steps: numbers 1 to 8 (0 … 7 < 7.2) are drafts
+    assert all(alike(a, b) for a, b in zip(drafted[:8], few[:8], strict=True))
+    assert drafted[8].misfit != few[8].misfit
+    assert drafted[0].misfit != all_[0].misfit
+    (again,) = run(data, dataclasses.replace(RECIPE, draft_sources=3, steps=9), resume=drafted[7])
+    expected = run(data, dataclasses.replace(RECIPE, draft_sources=None, steps=9), resume=drafted[7])
+    assert alike(again, expected[0])
+
+
+def test_float64_data_make_a_float64_volume(truth):
+    data = seen(truth).double()
+    step = run(data, dataclasses.replace(RECIPE, steps=2))[-1]
+    assert step.delta.dtype == torch.float64
+    single = run(data.float(), dataclasses.replace(RECIPE, steps=2))[-1]
+    assert volume_error(single.delta.double(), step.delta) < 0.05
+
+
+def test_one_slice_descends(truth):
+    grid = Grid((1, 16, 14), (0.5, 0.2, 0.2))
+    acquisition = Acquisition([Prism((0.0, 0.24), 1.5)], [0.0])
+    delta = truth[3:4]
+    with torch.no_grad():
+        data = image(Volume(grid, delta, BACKGROUND), MICROSCOPE, acquisition, FIDELITY)
+    *_, step = descend(data, grid, BACKGROUND, MICROSCOPE, acquisition, FIDELITY, RECIPE)
+    assert step.misfit < 0.1
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 14, 16), (1, 3, 16, 14), (2, 2, 16, 14), (3, 16, 14)])
+def test_data_of_another_shape_are_refused_with_both_shapes(shape):
+    with pytest.raises(ValueError, match=r"\(2, 3, 16, 14\)") as caught:
+        run(torch.rand(shape))
+    assert str(tuple(shape)) in str(caught.value)
+
+
+def test_uniform_data_are_refused():
+    with pytest.raises(ValueError, match="uniform"):
+        run(torch.full((2, 3, 16, 14), 0.5))
+
+
+@pytest.mark.parametrize("rate", [1e3, 1e30])
+@pytest.mark.parametrize("bounds", [Bounds(), Bounds(None, None), Bounds(-3.0, None)], ids=["0", "none", "below 0"])
+def test_a_descent_that_diverges_says_at_which_step(truth, rate, bounds):
+    recipe = dataclasses.replace(RECIPE, learning_rate=rate, bounds=bounds)
+    with pytest.raises(FloatingPointError, match=r"diverged at step \d+: the (loss is|index falls to)"):
+        run(seen(truth), recipe)
+
+
+def test_data_that_are_not_finite_do_not_pass_as_a_fit(truth):
+    data = seen(truth)
+    data[0, 0, 3, 3] = torch.nan
+    with pytest.raises((FloatingPointError, ValueError)):
+        run(data)
+
+
+@pytest.mark.parametrize(
+    ("values", "law"),
+    [
+        ({"steps": 0}, "steps 0 must be at least 1"),
+        ({"learning_rate": 0.0}, "learning_rate 0.0 must be above 0"),
+        ({"learning_rate": math.nan}, "learning_rate nan must be above 0"),
+        ({"tv": (-1.0, 1.0)}, "tv -1.0 must be at least 0"),
+        ({"tv": (1.0, math.inf)}, "tv inf must be at least 0"),
+        ({"l1": -0.1}, "l1 -0.1 must be at least 0"),
+        ({"start": "warm"}, "start 'warm' must be 'linear' or 'zero'"),
+        ({"draft_sources": 0}, "draft_sources 0 must be at least 1"),
+    ],
+)
+def test_an_unphysical_recipe_is_refused(values, law):
+    with pytest.raises(ValueError, match=law):
+        Recipe(**values)
+
+
+# going on after an interruption
+
+
+def test_resuming_from_any_step_ends_where_an_uninterrupted_run_does(truth):
+    data = seen(truth)
+    recipe = dataclasses.replace(RECIPE, steps=8, draft_sources=3)
+    steps = run(data, recipe)
+    for k, step in enumerate(steps):
+        rest = run(data, recipe, resume=step)
+        assert len(rest) == len(steps) - 1 - k
+        assert all(alike(a, b) for a, b in zip(rest, steps[k + 1 :], strict=True))
+
+
+def test_two_runs_are_bit_for_bit_the_same(truth):
+    one, other = run(seen(truth)), run(seen(truth))
+    assert all(alike(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_resuming_counts_the_seconds_on(truth):
+    steps = run(seen(truth))
+    late = dataclasses.replace(steps[5], seconds=1000.0)
+    assert run(seen(truth), resume=late)[0].seconds > 1000
+
+
+def test_resuming_leaves_the_step_that_it_went_on_from_alone(truth):
+    steps = run(seen(truth))
+    before = steps[4].parameter.clone(), steps[4].delta.clone(), steps[4].optimiser["state"][0]["exp_avg"].clone()
+    run(seen(truth), resume=steps[4])
+    assert torch.equal(steps[4].parameter, before[0])
+    assert torch.equal(steps[4].delta, before[1])
+    assert torch.equal(steps[4].optimiser["state"][0]["exp_avg"], before[2])
+
+
+@pytest.fixture
+def saved(truth, tmp_path):
+    """A checkpoint of step 5 on disk: (path, data, all steps)."""
+    data = seen(truth)
+    steps = run(data)
+    rows = [(s.number, s.misfit, s.loss, s.seconds) for s in steps[:5]]
+    path = tmp_path / "checkpoint.pt"
+    checkpoint.save(path, Checkpoint(steps[4], rows, "volume.shape = [6, 16, 14]\ndata's sha256 = abc"))
+    return path, data, steps
+
+
+def test_a_checkpoint_from_disk_ends_where_an_uninterrupted_run_does(saved):
+    path, data, steps = saved
+    again = checkpoint.load(path, "volume.shape = [6, 16, 14]\ndata's sha256 = abc")
+    assert alike(again.step, steps[4])
+    assert again.step.seconds == steps[4].seconds
+    assert again.rows == [(s.number, s.misfit, s.loss, s.seconds) for s in steps[:5]]
+    rest = run(data, resume=again.step)
+    assert all(alike(a, b) for a, b in zip(rest, steps[5:], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("identity", "named"),
+    [
+        ("volume.shape = [6, 16, 16]\ndata's sha256 = abc", "volume.shape was [6, 16, 14], is [6, 16, 16]"),
+        ("volume.shape = [6, 16, 14]\ndata's sha256 = 012", "data's sha256 was abc, is 012"),
+        ("volume.shape = [6, 16, 14]", "data's sha256 was abc, is absent"),
+        ("volume.shape = [6, 16, 14]\ndata's sha256 = abc\nfidelity.steps = 3", "fidelity.steps was absent, is 3"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused_with_what_changed(saved, identity, named):
+    path, _, _ = saved
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load(path, identity)
+    message = str(caught.value)
+    assert str(path) in message
+    assert named in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", None], ids=["empty", "text", "truncated"])
+def test_a_damaged_checkpoint_is_refused_in_one_line(saved, content):
+    path, _, _ = saved
+    path.write_bytes(path.read_bytes()[:-500] if content is None else content)
+    with pytest.raises(CheckpointError) as caught:
+        checkpoint.load(path, "")
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    torch.save({"weights": torch.zeros(3)}, path)
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt: is no checkpoint of this version"):
+        checkpoint.load(path, "")
+
+
+def test_a_checkpoint_that_fails_to_be_written_leaves_the_earlier_one(saved, monkeypatch):
+    path, _, steps = saved
+    before = path.read_bytes()
+
+    def fail(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", fail)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.save(path, Checkpoint(steps[7], [], ""))
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == ["checkpoint.pt"]
+
+
+# metrics
+
+
+def test_an_empty_volumes_error_is_1_and_the_truths_0(truth):
+    assert volume_error(torch.zeros_like(truth), truth) == 1
+    assert volume_error(truth, truth) == 0
+    assert volume_error(1.2 * truth, truth) == pytest.approx(0.2, rel=1e-5)
+
+
+def test_the_mean_inside_is_over_the_region_alone():
+    delta = torch.tensor([[[1.0, 2.0, 9.0]]])
+    assert mean_inside(delta, torch.tensor([[[True, True, False]]])) == 1.5
+
+
+def test_each_prism_has_its_own_residual():
+    images = torch.zeros(2, 3, 4, 5)
+    data = torch.stack([torch.full((3, 4, 5), 0.1), torch.full((3, 4, 5), -0.2)])
+    assert residual_rms(images, data) == pytest.approx([0.1, 0.2])
