@@ -139,7 +139,7 @@ def _specimen(config: Config, source: str) -> Any:
         raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
     values = dict(config.specimen)
     kind = values.pop("kind", None)
-    if kind not in SPECIMENS:
+    if not isinstance(kind, str) or kind not in SPECIMENS:
         raise ConfigError(f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}")
     values.setdefault("background", config.volume.background)
     return structure(values, SPECIMENS[kind], source, "specimen")
