@@ -1,0 +1,358 @@
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import tomli_w
+
+from recon.cli import SPECIMENS, main
+from torchdic.tiff import read_stack, write_stack
+
+CONFIG = """
+[volume]
+shape = [4, 14, 12]
+spacing = [0.5, 0.25, 0.25]
+background = 1.5
+[microscope]
+wavelength = 0.546
+objective = { na = 0.6 }
+condenser = { na = 0.3 }
+[acquisition]
+focus = [-0.5, 0.0, 0.5]
+prisms = [{ shear = [0.0, 0.24], bias = 1.5 }, { shear = [0.24, 0.0], bias = -1.2 }]
+[fidelity]
+sources = 3
+[reconstruction]
+steps = 2
+[specimen]
+kind = "gaussian_ball"
+sigma = 0.4
+contrast = 0.02
+centre = [0.2, 0.3, -0.4]
+[data]
+path = "stack.ome.tif"
+"""
+SHAPE = (2, 3, 14, 12)
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function from changes {key: value} of the configuration to its file; `...` takes a key away."""
+
+    def put(changes=None):
+        values = tomllib.loads(CONFIG)
+        for key, value in (changes or {}).items():
+            *folders, last = key.split(".")
+            place = values
+            for part in folders:
+                place = place.setdefault(part, {})
+            if value is ...:
+                del place[last]
+            else:
+                place[last] = value
+        path = tmp_path / "config.toml"
+        path.write_text(tomli_w.dumps(values), encoding="utf-8")
+        return path
+
+    return put
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    """A function that runs a command and returns (exit code, lines on stderr); results go to tmp_path/out."""
+
+    def call(*arguments, out=tmp_path / "out"):
+        try:
+            code = main([*map(str, arguments), "--out", str(out)])
+        except SystemExit as stop:  # argparse's way
+            code = stop.code
+        return code, capsys.readouterr().err.splitlines()
+
+    return call
+
+
+@pytest.fixture
+def refused(run, tmp_path):
+    """A function that runs a command, checks that it is refused without a trace, and returns the one line."""
+
+    def call(*arguments, out=tmp_path / "out"):
+        before = sorted(tmp_path.rglob("*"))
+        code, lines = run(*arguments, out=out)
+        assert code == 2
+        assert len(lines) == 1
+        assert "error: " in lines[0]
+        assert sorted(tmp_path.rglob("*")) == before
+        return lines[0]
+
+    return call
+
+
+def stack(seed=0, shape=SHAPE, dtype=np.float32):
+    return (0.5 + 0.02 * np.random.default_rng(seed).standard_normal(shape)).astype(dtype)
+
+
+# a stack that can't be used
+
+
+def missing(path):
+    pass
+
+
+def text(path):
+    path.write_text("x,y\n1,2\n" * 100, encoding="utf-8")
+
+
+def empty_file(path):
+    path.write_bytes(b"")
+
+
+def folder(path):
+    path.mkdir()
+
+
+def truncated(path):
+    write_stack(path, stack())
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def nan_pixels(path):
+    data = stack()
+    data[1, 2, 3, 4] = np.nan
+    tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata={"axes": "CZYX"})
+
+
+def one_more_plane(path):
+    write_stack(path, stack(shape=(2, 4, 14, 12)))
+
+
+def one_more_prism(path):
+    write_stack(path, stack(shape=(3, 3, 14, 12)))
+
+
+def one_plane(path):
+    write_stack(path, stack(shape=(14, 12)))
+
+
+def swapped_pixels(path):
+    write_stack(path, stack(shape=(2, 3, 12, 14)))
+
+
+def swapped_prism_and_focus(path):
+    write_stack(path, stack(shape=(3, 2, 14, 12)))
+
+
+def five_dimensions(path):
+    tifffile.imwrite(path, stack(shape=(2, 2, 3, 14, 12)), ome=False, photometric="minisblack")
+
+
+def time_points(path):
+    data = stack(shape=(4, 2, 3, 14, 12))
+    tifffile.imwrite(path, data, ome=True, photometric="minisblack", metadata={"axes": "TCZYX"})
+
+
+def rgb(path):
+    tifffile.imwrite(path, np.zeros((14, 12, 3), np.uint8), photometric="rgb")
+
+
+def empty_stack(path):
+    with pytest.warns(UserWarning, match="zero-size"):
+        tifffile.imwrite(path, np.zeros((0, 14, 12), np.float32), ome=False, photometric="minisblack")
+
+
+def no_pages(path):
+    path.write_bytes(b"II*\0\0\0\0\0")
+
+
+def uniform(path):
+    write_stack(path, np.full(SHAPE, 0.5, np.float32))
+
+
+def uniform_counts(path):
+    write_stack(path, np.full(SHAPE, 1234, np.uint16))
+
+
+def dark(path):
+    write_stack(path, np.zeros(SHAPE, np.uint16))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (missing, ["no such file"]),
+        (text, ["no TIFF"]),
+        (empty_file, ["empty"]),
+        (folder, ["folder"]),
+        (truncated, ["truncated"]),
+        (nan_pixels, ["1 of 1008 pixels are not finite", "1 NaN"]),
+        (one_more_plane, ["2 prisms × 4 planes", "2 × 3"]),
+        (one_more_prism, ["3 prisms × 3 planes", "2 × 3"]),
+        (one_plane, ["1 prism × 1 plane", "2 × 3"]),
+        (swapped_prism_and_focus, ["3 prisms × 2 planes", "2 × 3"]),
+        (swapped_pixels, ["12 × 14 pixels", "14 × 12"]),
+        (five_dimensions, ["more dimensions"]),
+        (time_points, ["4 time points"]),
+        (rgb, ["colour image", "3 samples"]),
+        (empty_stack, ["empty"]),
+        (no_pages, ["no pages"]),
+        (uniform, ["uniform", "nothing to fit"]),
+        (uniform_counts, ["uniform", "nothing to fit"]),
+        (dark, ["must stay above 0"]),
+    ],
+)
+def test_a_stack_that_cannot_be_used_is_refused_in_one_line(write, refused, tmp_path, make, words):
+    make(tmp_path / "stack.ome.tif")
+    line = refused("reconstruct", write())
+    assert str(tmp_path / "stack.ome.tif") in line
+    assert [word for word in words if word not in line] == []
+
+
+def test_an_extinct_prisms_counts_ask_for_a_scale(write, refused, tmp_path):
+    write_stack(tmp_path / "stack.ome.tif", (1000 * stack()).astype(np.uint16))
+    prisms = [{"shear": [0.0, 0.24], "bias": 0.0}, {"shear": [0.24, 0.0], "bias": 1.0}]
+    assert "give scale" in refused("reconstruct", write({"acquisition.prisms": prisms}))
+
+
+# a configuration that can't be used
+
+BAD_VALUES = [
+    ("microscope.wavelength", -0.546, ["microscope", "wavelength -0.546", "above 0"]),
+    ("microscope.objective", {"na": 1.7}, ["objective NA 1.7", "index 1.5"]),
+    ("microscope.condenser", {"na": 1.7}, ["condenser NA 1.7", "index 1.5"]),
+    ("microscope.wavelenght", 0.5, ["microscope.wavelenght", "did you mean 'wavelength'"]),
+    ("volume.shape", [4, 0, 12], ["volume", "(4, 0, 12)", "at least 1"]),
+    ("volume.shape", [0, 0, 0], ["volume", "(0, 0, 0)", "at least 1"]),
+]
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "simulate"])
+@pytest.mark.parametrize(("key", "value", "words"), BAD_VALUES)
+def test_a_bad_configuration_is_refused_in_one_line(write, refused, tmp_path, command, key, value, words):
+    write_stack(tmp_path / "stack.ome.tif", stack())
+    line = refused(command, write({key: value}))
+    assert str(tmp_path / "config.toml") in line
+    assert [word for word in words if word not in line] == []
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "simulate"])
+def test_a_missing_configuration_is_refused(refused, tmp_path, command):
+    line = refused(command, tmp_path / "none.toml")
+    assert str(tmp_path / "none.toml") in line
+    assert "No such file" in line
+
+
+def test_a_reconstruction_without_data_is_refused(write, refused):
+    path = write({"data": ...})
+    line = refused("reconstruct", path)
+    assert str(path) in line
+    assert "missing key data.path" in line
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"specimen": ...}, ["missing key specimen"]),
+        ({"specimen.kind": ...}, ["specimen.kind", "None", *map(repr, SPECIMENS)]),
+        ({"specimen.kind": "beed"}, ["specimen.kind", "'beed'", "'bead'"]),
+        ({"specimen.kind": ["bead"]}, ["specimen.kind", "['bead']", "'bead'"]),
+        ({"specimen.sgima": 1}, ["unknown key specimen.sgima", "did you mean 'sigma'"]),
+        ({"specimen.sigma": ...}, ["missing key specimen.sigma"]),
+        ({"specimen.sigma": "wide"}, ["specimen.sigma", "'wide'", "a number"]),
+        ({"specimen.sigma": -1.0}, ["specimen", "sigma -1.0", "above 0"]),
+        ({"specimen.contrast": -1.0}, ["specimen", "1.5", "-1.0", "at least 1"]),
+        ({"specimen.background": 1.4}, ["specimen.background 1.4", "volume.background 1.5"]),
+        ({"simulation.exact": True}, ["simulation.exact", "isn't known"]),
+    ],
+)
+def test_a_specimen_that_cannot_be_used_is_refused(write, refused, changes, words):
+    path = write(changes)
+    line = refused("simulate", path)
+    assert str(path) in line
+    assert [word for word in words if word not in line] == []
+
+
+# a command that can't be used
+
+
+def test_an_unknown_device_is_refused(write, refused):
+    assert "'gpu9' is no device here" in refused("simulate", write(), "--device", "gpu9")
+    assert "'meta' is no device here" in refused("simulate", write(), "--device", "meta")
+
+
+def test_resume_and_restart_exclude_each_other(write, refused):
+    line = refused("reconstruct", write(), "--resume", "--restart")
+    assert "--restart" in line
+    assert "--resume" in line
+
+
+@pytest.mark.parametrize("arguments", [["simulate"], ["deconvolve"], []])
+def test_an_incomplete_command_is_refused(refused, arguments):
+    refused(*arguments)
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "simulate"])
+@pytest.mark.parametrize("out", ["file", "file/deeper", "file/deeper/still"])
+def test_a_folder_that_cannot_be_written_to_is_refused(write, refused, tmp_path, command, out):
+    write_stack(tmp_path / "stack.ome.tif", stack())
+    (tmp_path / "file").write_text("precious", encoding="utf-8")
+    line = refused(command, write(), out=tmp_path / out)
+    assert str(tmp_path / out) in line
+    assert "can't be written to" in line
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "precious"
+
+
+def test_demo_checks_its_folder_before_it_begins(refused, tmp_path):
+    (tmp_path / "file").write_text("precious", encoding="utf-8")
+    assert "can't be written to" in refused("demo", out=tmp_path / "file")
+
+
+# what works
+
+
+@pytest.mark.parametrize(
+    "specimen",
+    [
+        {"kind": "bead", "radius": 0.6, "contrast": 0.03},
+        {"kind": "gaussian_ball", "sigma": 0.4, "contrast": -0.02, "centre": [0, 0.1, 0.2]},
+        {"kind": "etched_glass", "height": 0.3, "glass": 1.52},
+        {
+            "kind": "cell",
+            "cytoplasm": {"shape": {"semi_axes": [0.9, 1.2, 1.0]}, "contrast": 0.02},
+            "nucleus": {"shape": {"semi_axes": [0.4, 0.4, 0.4], "centre": [0.0, 0.2, 0.1]}, "contrast": 0.03},
+            "nucleoli": [],
+            "vacuole": "none",
+            "lipid": "none",
+        },
+    ],
+    ids=lambda specimen: specimen["kind"],
+)
+def test_each_specimen_is_simulated_from_its_file(write, run, tmp_path, specimen):
+    assert run("simulate", write({"specimen": specimen})) == (0, [])
+    written = read_stack(tmp_path / "out" / "stack.ome.tif")
+    assert written.data.shape == SHAPE
+    assert written.data.std(axis=(2, 3)).min() > 1e-4  # the specimen shows in every image
+
+
+def test_a_folder_in_a_folder_that_is_not_there_yet_is_made(write, run, tmp_path):
+    assert run("simulate", write(), out=tmp_path / "a" / "b")[0] == 0
+    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["stack.ome.tif", "stack.png"]
+
+
+def test_the_installed_command_answers_with_one_line_and_exit_code_2(write, tmp_path):
+    script = Path(sys.executable).with_name("torchdic")
+    done = subprocess.run(
+        [script, "reconstruct", write({"microscope.wavelenght": 1}), "--out", tmp_path / "out"],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "did you mean 'wavelength'?" in done.stderr
+    assert not (tmp_path / "out").exists()
