@@ -219,7 +219,7 @@ def check_apertures(microscope: Microscope, background: float) -> None:
 
 def _check_sampling(microscope: Microscope, grid: Grid) -> None:
     reach = microscope.reach
-    coarsest = max(d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1 or d == min(grid.spacing))
+    coarsest = max((d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=0.0)
     if reach > 0 and coarsest > microscope.wavelength / (2 * reach):
         warnings.warn(
             f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "
