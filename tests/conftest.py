@@ -78,13 +78,9 @@ def load():
 def smooth_field():
     """A smooth random field (z, y, x) that is nowhere 0 or alike in any two axes; about ±size."""
 
-    def make(
-        grid: Grid, size: float = 1.0, dtype: torch.dtype = torch.float64, seed: int = 0
-    ) -> torch.Tensor:
+    def make(grid: Grid, size: float = 1.0, dtype: torch.dtype = torch.float64, seed: int = 0) -> torch.Tensor:
         random = torch.Generator().manual_seed(seed)
-        z, y, x = torch.meshgrid(
-            *(grid.coordinates(axis, dtype=torch.float64) for axis in range(3)), indexing="ij"
-        )
+        z, y, x = torch.meshgrid(*(grid.coordinates(axis, dtype=torch.float64) for axis in range(3)), indexing="ij")
         field = torch.zeros(grid.shape, dtype=torch.float64)
         for _ in range(8):
             fz, fy, fx, phase, part = torch.rand(5, generator=random, dtype=torch.float64).tolist()

@@ -167,9 +167,9 @@ def test_tensor_keeps_its_graph(point, propagation):
     (gradient,) = torch.autograd.grad(of(theta), theta)
     step = 1e-5
     with torch.no_grad():
-        expected = (
-            8 * (of(theta + step) - of(theta - step)) - (of(theta + 2 * step) - of(theta - 2 * step))
-        ) / (12 * step)
+        expected = (8 * (of(theta + step) - of(theta - step)) - (of(theta + 2 * step) - of(theta - 2 * step))) / (
+            12 * step
+        )
     assert float(gradient) == pytest.approx(float(expected), rel=1e-6)
 
 

@@ -36,9 +36,7 @@ def test_thin_object_agrees_with_the_reference_implementation(load, specimen):
         Condenser(float(data["na_condenser"]), points=data["source_na_yx"]),
     )
     prism = Prism(tuple(data["shear_yx"].tolist()), float(data["bias"]))
-    images = image_field(
-        transmission, grid, microscope, Acquisition([prism, None]), background=float(data["n_medium"])
-    )
+    images = image_field(transmission, grid, microscope, Acquisition([prism, None]), background=float(data["n_medium"]))
     in_focus = data["focus_paraxial"].tolist().index(0.0)
     # the reference summed in single precision: 1e-6 for DIC, 2e-6 for bright field
     for found, kind in zip(images[:, 0], ("dic", "brightfield"), strict=True):
