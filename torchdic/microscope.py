@@ -77,7 +77,7 @@ class Acquisition:
         if len(self.prisms) == 0 or len(self.focus) == 0:
             raise ValueError("an acquisition needs at least one prism (or None for bright field) and one focus plane")
         for focus in self.focus:
-            depth = float(torch.as_tensor(focus).detach())
+            depth = float(torch.as_tensor(focus, dtype=torch.float64).detach())
             if not math.isfinite(depth):
                 raise ValueError(f"focus {depth} must be a finite depth in µm")
         object.__setattr__(self, "prisms", tuple(self.prisms))
@@ -137,7 +137,7 @@ def image_field(
     the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
     the medium. Raises ValueError as `image` does, and where a shape is not the grid's.
     """
-    check_apertures(microscope, float(torch.as_tensor(background).detach()))
+    check_apertures(microscope, float(torch.as_tensor(background, dtype=torch.float64).detach()))
     _check_sampling(microscope, grid)
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))

@@ -27,7 +27,7 @@ class Objective:
         for index, value in (self.aberrations or {}).items():
             if isinstance(index, bool) or not isinstance(index, int) or index < 1:
                 raise ValueError(f"aberration {index!r}: a Noll index is a whole number from 1")
-            coefficient = float(torch.as_tensor(value).detach())
+            coefficient = float(torch.as_tensor(value, dtype=torch.float64).detach())
             if not math.isfinite(coefficient):
                 raise ValueError(f"aberration {index}: {coefficient} rad must be a finite number")
 

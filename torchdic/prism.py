@@ -24,7 +24,7 @@ class Prism:
         if len(self.shear) != 2:
             raise ValueError(f"shear has {len(self.shear)} components: it must be (y, x) in µm")
         for name, value in (("shear y", self.shear[0]), ("shear x", self.shear[1]), ("bias", self.bias)):
-            number = float(torch.as_tensor(value).detach())
+            number = float(torch.as_tensor(value, dtype=torch.float64).detach())
             if not math.isfinite(number):
                 raise ValueError(f"{name} {number} must be a finite number")
 

@@ -34,7 +34,7 @@ class Volume(nn.Module):
             _check_field("absorption", absorption, grid)
             if bool((absorption < 0).any()):
                 raise ValueError(f"absorption {float(absorption.detach().min()):g} is negative: κ must be at least 0")
-        index = float(torch.as_tensor(background).detach())
+        index = float(torch.as_tensor(background, dtype=torch.float64).detach())
         if not (index > 0 and index < float("inf")):
             raise ValueError(f"background {index} must be a refractive index above 0")
         lowest = index + float(delta.detach().min())
