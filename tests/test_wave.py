@@ -58,7 +58,7 @@ def ball_volume(slices=24, contrast=0.05, dtype=torch.float64, n=36):
 
 @pytest.mark.parametrize(("order", "slices", "contrast"), [(1, 256, 0.1), (2, 64, 0.05)])
 def test_split_step_has_its_order_in_the_slab(order, slices, contrast):
-    """Half the slab, 2^order less change. The 4-FFT form leaves out (φ(G² − 1))², first order, but tiny: not seen here."""
+    """Half the slab, 2^order less change. The 4-FFT form leaves out (φ(G² − 1))²: first order, but not seen here."""
     volume = ball_volume(slices, contrast, n=36 if order == 2 else 24)
     fields = [
         split_step(volume, WAVELENGTH, momentum([0.3, -0.4]), Fidelity("wave", order=order, steps=slices // n))

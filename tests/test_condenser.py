@@ -1,0 +1,107 @@
+"""The aperture as plane waves: a quadrature over the disc, or points as given."""
+
+import math
+
+import pytest
+import torch
+
+from data_synthetic import GaussianBall
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+from torchdic.condenser import disc_quadrature
+
+
+def disc_mean(p, q):
+    """The mean of y^p·x^q over the unit disc: 0 for odd powers, else a ratio of Γ functions."""
+    if p % 2 or q % 2:
+        return 0.0
+    return math.gamma((p + 1) / 2) * math.gamma((q + 1) / 2) / math.gamma((p + q) / 2 + 2) / math.pi
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 12, 20, 40, 61, 120])
+def test_sources_lie_in_the_disc_with_weights_of_sum_one(count, dtype):
+    points, weights = Condenser(0.6).sources(count, dtype=dtype)
+    assert points.dtype == weights.dtype == dtype
+    assert points.shape == (len(weights), 2)
+    assert len(weights) <= count
+    assert float(points.norm(dim=-1).max()) <= 0.6 * (1 + 1e-6)
+    assert float(weights.min()) > 0
+    assert float(weights.sum()) == pytest.approx(1, abs=4 * torch.finfo(dtype).eps)
+    torch.testing.assert_close(weights @ points, torch.zeros(2, dtype=dtype), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "degree"), [(12, 3), (40, 7), (120, 13)])
+def test_quadrature_is_exact_for_polynomials_over_the_disc(count, degree):
+    points, weights = disc_quadrature(count)
+    for p in range(degree + 1):
+        for q in range(degree + 1 - p):
+            found = (weights * points[:, 0] ** p * points[:, 1] ** q).sum()
+            assert found == pytest.approx(disc_mean(p, q), abs=1e-13), (p, q)
+
+
+def test_image_converges_fast_with_the_number_of_sources():
+    """Against 400 sources: 6, 24 and 96 err ever less, 24 by less than 1 % of the contrast."""
+    grid = Grid((8, 36, 36), (0.4, 0.18, 0.18))
+    volume = Volume(grid, GaussianBall(0.7, 0.02, 1.36, (0.3, -0.2, 0.4)).delta(grid), 1.36)
+    microscope = Microscope(0.546, Objective(0.8), Condenser(0.6))
+
+    def of(count):
+        acquisition = Acquisition([Prism((0.1, 0.2), 1.2)], [0.0, 1.5])
+        return image(volume, microscope, acquisition, Fidelity("wave", sources=count))
+
+    exact = of(400)
+    contrast = float((exact - math.sin(0.6) ** 2).abs().max())
+    error = [float((of(n) - exact).abs().max()) / contrast for n in (6, 24, 96)]
+    assert error[1] < 0.01
+    assert error[0] > 2 * error[1] > 3 * error[2]
+
+
+def test_aperture_of_zero_is_one_axial_wave():
+    points, weights = Condenser(0.0).sources(40, dtype=torch.float64)
+    assert points.tolist() == [[0.0, 0.0]]
+    assert weights.tolist() == [1.0]
+
+
+def test_given_points_override_the_count_and_keep_their_order():
+    given = torch.tensor([[0.1, -0.2], [0.0, 0.3], [-0.4, 0.0]], dtype=torch.float64)
+    points, weights = Condenser(0.5, points=given).sources(1, dtype=torch.float64)
+    assert torch.equal(points, given)
+    torch.testing.assert_close(weights, torch.full((3,), 1 / 3, dtype=torch.float64))
+
+
+def test_weights_are_made_to_sum_to_one_and_none_means_equal(smooth_field):
+    grid = Grid((3, 9, 10), (0.5, 0.2, 0.2))
+    volume = Volume(grid, smooth_field(grid, 0.02), 1.36)
+    points = torch.tensor([[0.1, -0.2], [0.0, 0.3], [-0.4, 0.0]], dtype=torch.float64)
+
+    def of(weights):
+        microscope = Microscope(0.546, Objective(0.8), Condenser(0.4, points=points, weights=weights))
+        return image(volume, microscope, Acquisition([Prism((0.1, 0.2), 1.2)]), Fidelity("wave"))
+
+    uneven = torch.tensor([1.0, 3.0, 4.0], dtype=torch.float64)
+    assert torch.equal(of(None), of(torch.full((3,), 5.0)))
+    assert torch.equal(of(uneven), of(8 * uneven))
+    alone = [of(torch.eye(3, dtype=torch.float64)[i]) for i in range(3)]
+    torch.testing.assert_close(of(uneven), (alone[0] + 3 * alone[1] + 4 * alone[2]) / 8)
+    assert float((of(uneven) - of(None)).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((-0.1,), r"condenser NA -0\.1 must be at least 0"),
+        ((math.inf,), r"condenser NA inf"),
+        ((0.5, None, torch.ones(3)), r"weights need the points"),
+        ((0.5, torch.zeros(2, 2), torch.tensor([1.0, -0.1])), r"weights must be at least 0"),
+        ((0.5, torch.zeros(2, 2), torch.zeros(2)), r"positive finite sum"),
+        ((0.5, torch.full((2, 2), math.nan)), r"points must be finite"),
+        ((0.5, torch.zeros(0, 2)), r"points have shape \(0, 2\)"),
+    ],
+)
+def test_errors_state_the_numbers_and_the_law(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Condenser(*arguments)
+
+
+def test_no_sources_are_an_error():
+    with pytest.raises(ValueError, match="at least 1 source, not 0"):
+        Condenser(0.5).sources(0)

@@ -1,0 +1,43 @@
+"""How carefully to compute, and nothing else."""
+
+import dataclasses
+import math
+
+import pytest
+
+from torchdic import DRAFT, REFERENCE, STANDARD, Fidelity
+
+
+def test_every_field_but_propagation_has_a_default():
+    for field in dataclasses.fields(Fidelity):
+        assert field.name == "propagation" or field.default is not dataclasses.MISSING
+    for propagation in ("projection", "rays", "wave"):
+        assert Fidelity(propagation).propagation == propagation
+        assert Fidelity(propagation=propagation).steps is None
+
+
+def test_presets_are_ordered_by_care():
+    assert DRAFT.sources < STANDARD.sources < REFERENCE.sources
+    assert Fidelity("wave") == STANDARD
+    assert len({DRAFT, STANDARD, REFERENCE}) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "steps 0 must be at least 1"),
+        ({"sources": 0}, "sources 0 must be at least 1"),
+        ({"padding": -1}, "padding -1 must be at least 0"),
+        ({"tolerance": 0.0}, r"tolerance 0\.0 must be above 0"),
+        ({"tolerance": math.nan}, "tolerance nan must be above 0"),
+        ({"memory": 0}, "memory 0 must be above 0"),
+    ],
+)
+def test_errors_state_the_number_and_the_law(options, message):
+    with pytest.raises(ValueError, match=message):
+        Fidelity("wave", **options)
+
+
+def test_fidelity_cannot_be_changed_in_place():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        STANDARD.steps = 3  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,66 @@
+"""Memory bounded without a change of result."""
+
+import pytest
+import torch
+
+from torchdic.recompute import recompute, slabs, sum_over_sources
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 10, 17, 100])
+def test_slabs_follow_one_another_from_the_first_step_to_the_last(steps):
+    assert list(slabs(steps, split=False)) == [(0, steps)]
+    split = list(slabs(steps, split=True))
+    assert [i for first, last in split for i in range(first, last)] == list(range(steps))
+    assert all(last > first for first, last in split)
+    # about √steps slabs of √steps each: the least that is kept at once
+    assert max(len(split), max(last - first for first, last in split)) <= steps**0.5 + 1
+
+
+def test_recomputed_values_are_not_kept():
+    """Autograd holds what a function saves; recomputing, only its arguments."""
+    saved = []
+    x = torch.rand(1000, requires_grad=True)
+
+    def chain(x):
+        for _ in range(10):
+            x = x.sin()
+        return x
+
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: saved.append(t.numel()) or t, lambda t: t):
+        kept = chain(x)
+    assert sum(saved) >= 10_000
+    calls = []
+
+    def counted(x):
+        calls.append(1)
+        return chain(x)
+
+    again = recompute(counted, x, when=True)
+    assert torch.equal(again, kept)
+    (gradient,) = torch.autograd.grad(again.sum(), x)
+    (expected,) = torch.autograd.grad(kept.sum(), x)
+    assert torch.equal(gradient, expected)
+    assert len(calls) == 2
+    with torch.no_grad():
+        recompute(counted, x, when=True)
+    assert len(calls) == 3
+    recompute(counted, x, when=False).sum().backward()
+    assert len(calls) == 4
+
+
+@pytest.mark.parametrize("memory", [1, 3 * 4 * 8 * 5 * 2, 1 << 30])
+def test_sum_over_sources_does_not_depend_on_the_batches(memory):
+    values = torch.arange(7, dtype=torch.float64, requires_grad=True)
+    weights = torch.linspace(1, 2, 7, dtype=torch.float64)
+    sizes = []
+
+    def function(values, weights):
+        sizes.append(len(values))
+        return (values.square() * weights).sum()
+
+    total = sum_over_sources(function, (values, weights), pixels=4, kept=5, memory=memory)
+    assert sum(sizes) == 7
+    assert max(sizes) == {1: 1, 960: 6, 1 << 30: 7}[memory]
+    assert float(total.detach()) == pytest.approx(float((values.detach().square() * weights).sum()))
+    total.backward()
+    torch.testing.assert_close(values.grad, 2 * values.detach() * weights)
