@@ -5,12 +5,13 @@ import math
 import signal
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
+from tqdm import tqdm
 
 from data_synthetic import Bead, CellPhantom, EtchedGlassStep, GaussianBall, GradedIndexRod, LayeredMedium
 from recon import figures
@@ -49,8 +50,8 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, or 2 for bad input, 130 for an interruption."""
     options = _parser().parse_args(arguments)
-    warnings.showwarning = _show_warning
-    warnings.simplefilter("once", SamplingWarning)
+    warnings.showwarning = _show_each_once()
+    warnings.simplefilter("always", SamplingWarning)
     try:
         options.command(options)
     except (ConfigError, StackError, CheckpointError) as error:
@@ -206,8 +207,16 @@ def _interrupt(_number: int, _frame: object) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    print(f"torchdic: warning: {message}", file=sys.stderr)
+def _show_each_once() -> Callable[..., None]:
+    """A way of showing warnings: Python's own "once" is once for each calling module."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)  # on a line of its own, above the bar
+
+    return show
 
 
 def _fail(message: str, code: int) -> int:

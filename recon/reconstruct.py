@@ -87,7 +87,6 @@ def reconstruct(
         elif not restart:
             raise CheckpointError(f"{saved}: an interrupted run; go on with --resume or begin anew with --restart")
     prepare_folder(out)
-    _write_text(out / "config.toml", dump(config))
 
     last, rows = _descend(config, fidelity, data, out, identity, start)
     grid = config.volume.grid
@@ -97,6 +96,7 @@ def reconstruct(
     data, delta = data.cpu(), last.delta.cpu()
     metrics = {"propagation": fidelity.propagation, **_metrics(measured, modelled, data, delta, last)}
     write_volume(out / "volume.ome.tif", delta, grid)
+    _write_text(out / "config.toml", dump(config))
     _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     prisms, focus = config.acquisition.prisms, measured.focus
     figures.save(figures.draw_images(data, modelled, prisms, focus, grid), out / "images.png")
