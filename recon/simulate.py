@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, image_field
 
-# The exact field is spread over an array so many times as wide and cropped after imaging: what leaves the volume's
-# sides must not come back on the other one.
-WIDTH = 2
+# The exact field is spread over an array wider by this fraction on each side and cropped after imaging: what leaves the
+# volume's sides must not come back on the other one.
+MARGIN = 0.5
 
 
 class ExactSpecimen(Protocol):
@@ -42,13 +42,13 @@ def exact_images(
 ) -> Float[Tensor, "prism focus y x"]:
     """Images of a specimen from its exact field, float64: none of our propagations takes part."""
     nz, ny, nx = grid.shape
-    wide = replace(grid, shape=(nz, WIDTH * ny, WIDTH * nx))
+    top, left = round(MARGIN * ny), round(MARGIN * nx)  # alike on both sides: the centre stays the centre
+    wide = replace(grid, shape=(nz, ny + 2 * top, nx + 2 * left))
     points, weights = microscope.sources(fidelity, dtype=torch.float64, device=torch.device("cpu"))
     na = None
     if microscope.objective is not None:
         na = min(1.05 * microscope.objective.na, specimen.background)
     total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), ny, nx, dtype=torch.float64)
-    top, left = (WIDTH - 1) * ny // 2, (WIDTH - 1) * nx // 2
     for some, share in zip(points.split(16), weights.split(16), strict=True):
         part = replace(microscope, condenser=Condenser(microscope_na(microscope), some, share))
         field = specimen.field(wide, microscope.wavelength, some, padding=1.0, na=na)
