@@ -133,7 +133,9 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
             path = odeint(slope, state, ends, **_solver_options(fidelity, steps, grid.spacing[0]))
         except AssertionError:
             # an adaptive solver gives up where a ray turns; equal steps leave nan there, to be counted below
-            path = odeint(slope, state, ends, **_solver_options(replace(fidelity, solver="rk4"), steps, grid.spacing[0]))
+            path = odeint(
+                slope, state, ends, **_solver_options(replace(fidelity, solver="rk4"), steps, grid.spacing[0])
+            )
             if bool(torch.isfinite(torch.as_tensor(path[-1])).all()):
                 raise
         assert isinstance(path, Tensor)
