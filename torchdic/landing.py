@@ -161,7 +161,8 @@ class _Mesh:
 def _caustic_phase(leaving: Tensor, landed: Tensor, *, forward: bool = False) -> Tensor:
     """−π/2 for a caustic crossed on the way to the exit, +π/2 for each crossed on the way back to the reference plane.
 
-    forward: the plane lies behind the exit, and its caustics cost −π/2 too. Both meshes are given by two edges of each triangle, (source, triangle, 2, 2).
+    forward: the plane lies behind the exit, and its caustics cost −π/2 too. Both meshes are given by two edges of
+    each triangle, (source, triangle, 2, 2).
     """
     start, stop = _cross(*leaving.unbind(2)), _cross(*landed.unbind(2))
     # the area on the way is a parabola in the fraction s of the way: start + slope·s + bend·s²
