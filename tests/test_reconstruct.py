@@ -371,12 +371,21 @@ def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
 # interruptions
 
 
-def interrupted(workplace, out, number, wanted=12):
+@pytest.fixture(scope="module")
+def long(workplace):
+    """(configuration, folder of results) of an uninterrupted run that takes long enough to be hit on its way."""
+    path = workplace / "long.toml"
+    path.write_text(merged({"reconstruction": {"steps": 250}}), encoding="utf-8")
+    assert command("reconstruct", path, "--out", workplace / "long")[0] == 0
+    return path, workplace / "long"
+
+
+def interrupted(path, out, number, wanted=12):
     """Run `torchdic reconstruct` in a process, send it a signal when its log has so many rows; its exit code."""
     script = Path(sys.executable).with_name("torchdic")
     env = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads()), "OMP_WAIT_POLICY": "PASSIVE"}
     process = subprocess.Popen(
-        [script, "reconstruct", workplace / "config.toml", "--out", out],
+        [script, "reconstruct", path, "--out", out],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         env=env,
@@ -396,11 +405,12 @@ def interrupted(workplace, out, number, wanted=12):
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
-def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(workplace, tmp_path, name):
+def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp_path, name):
+    path, whole = long
     out = tmp_path / "out"
-    code, err = interrupted(workplace, out, getattr(signal, name))
+    code, err = interrupted(path, out, getattr(signal, name))
     done = len(rows(out))
-    assert 12 <= done < 120
+    assert 12 <= done < 250
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
     assert not RESULTS - {"log.csv"} & set(content(out))  # no result is there before its time
     if name == "SIGKILL":
@@ -408,15 +418,14 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(workplace
         assert done - kept <= 5  # at most one interval
     else:
         assert code == 130
-        assert f"torchdic: error: interrupted after step {kept} of 120; go on with --resume" in err
+        assert f"torchdic: error: interrupted after step {kept} of 250; go on with --resume" in err
         assert "Traceback" not in err
         assert kept == done
-    assert command("reconstruct", workplace / "config.toml", "--out", out, "--resume")[0] == 0
-    assert torch.equal(volume(out), volume(workplace / "whole"))
-    log, whole = rows(out), rows(workplace / "whole")
-    assert [row["step"] for row in log] == [row["step"] for row in whole]
-    assert [row["misfit"] for row in log] == [row["misfit"] for row in whole]
-    assert [row["loss"] for row in log] == [row["loss"] for row in whole]
+    assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
+    assert torch.equal(volume(out), volume(whole))
+    assert [row["step"] for row in rows(out)] == [str(number) for number in range(1, 251)]
+    for column in ("misfit", "loss"):
+        assert [row[column] for row in rows(out)] == [row[column] for row in rows(whole)]
     assert {name for name in content(out) if not name.startswith(".")} == RESULTS
 
 
