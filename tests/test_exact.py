@@ -82,9 +82,7 @@ def test_optical_theorem(radius, n_sphere):
 @pytest.mark.parametrize("point", [AXIAL, OBLIQUE])
 def test_field_and_its_slope_are_continuous_at_the_surface(point):
     generator = torch.Generator().manual_seed(1)
-    normal = torch.nn.functional.normalize(
-        torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1
-    )
+    normal = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator, dtype=torch.float64), dim=-1)
     centre = (0.4, -0.2, 0.7)
 
     def at(r):
@@ -155,8 +153,7 @@ def test_lone_sphere_is_approached_as_padding_grows():
     grid = Grid((1, 64, 64), (0.2, 0.2, 0.2))
     lone = sphere_field(grid, *SPHERE, OBLIQUE[None], padding=12.0, na=0.9)
     errors = [
-        rms(sphere_field(grid, *SPHERE, OBLIQUE[None], padding=padding, na=0.9) - lone)
-        for padding in (1.0, 2.0, 4.0)
+        rms(sphere_field(grid, *SPHERE, OBLIQUE[None], padding=padding, na=0.9) - lone) for padding in (1.0, 2.0, 4.0)
     ]
     errors = [error / rms(lone - 1) for error in errors]
     assert errors[0] < 2e-2

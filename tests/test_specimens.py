@@ -114,8 +114,7 @@ def test_index_does_not_depend_on_voxel_size():
     ball, bead = GaussianBall(1.0, 0.03, 1.36, (0.3, 0.1, -0.2)), Bead(2.0, 0.03, 1.56, (0.3, 0.1, -0.2))
     sums = {
         each(s): [
-            float(s.delta(Grid((2 * n, 2 * n + 1, 2 * n), (10 / n,) * 3)).sum()) * (10 / n) ** 3
-            for n in (24, 40)
+            float(s.delta(Grid((2 * n, 2 * n + 1, 2 * n), (10 / n,) * 3)).sum()) * (10 / n) ** 3 for n in (24, 40)
         ]
         for s in (ball, bead)
     }
