@@ -181,7 +181,7 @@ def _first_problem(error: Exception, where: str) -> str | None:
     return problems[0] if problems else None
 
 
-def _describe(error: BaseException, _: type | None) -> str:
+def _describe(error: BaseException, _: Any) -> str:
     if isinstance(error, ForbiddenExtraKeysError):
         name = min(error.extra_fields)
         known = [f.name for f in dataclasses.fields(error.cl)]
@@ -235,7 +235,7 @@ def _sequence_of(hook: Callable[[Any, Any], Any]) -> Callable[[Any, Any], tuple[
             return hook(value, None)
         except Exception as error:
             error.add_note(IterableValidationNote(f"element {index}", index, None))
-            raise IterableValidationError("an array's element", [error], tuple) from error
+            raise IterableValidationError("an array's element", [error], tuple) from error  # pyright: ignore[reportCallIssue]
 
     return structure_all
 

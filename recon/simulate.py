@@ -1,7 +1,7 @@
 """Images of a known specimen: through one of the propagations, or from its exact field."""
 
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Complex, Float
@@ -14,6 +14,7 @@ from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, image_f
 MARGIN = 0.5
 
 
+@runtime_checkable
 class ExactSpecimen(Protocol):
     """A specimen that knows the exact field behind it."""
 
