@@ -168,16 +168,17 @@ def test_the_misfit_is_drawn_over_the_steps_on_a_logarithmic_scale(tmp_path):
     drawn(figure, tmp_path / "misfit.png")
 
 
-def test_a_figure_that_cannot_be_saved_leaves_the_earlier_one(tmp_path):
+def test_a_figure_that_cannot_be_saved_leaves_the_earlier_one(tmp_path, monkeypatch):
     path = tmp_path / "misfit.png"
     path.write_bytes(b"earlier")
+    figure = figures.draw_misfit([(1, 0.9, 1.0, 0.1)])
 
-    class Broken:
-        def savefig(self, *_, **__):
-            raise MemoryError
+    def fail(*_, **__):
+        raise MemoryError
 
+    monkeypatch.setattr(figure, "savefig", fail)
     with pytest.raises(MemoryError):
-        figures.save(Broken(), path)
+        figures.save(figure, path)
     assert path.read_bytes() == b"earlier"
     assert list(tmp_path.iterdir()) == [path]
 
