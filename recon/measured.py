@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Real
@@ -61,7 +60,7 @@ def prepare(
     *,
     pixels: tuple[int, int] | None = None,
     flatten: bool | None = None,
-    scale: float | Literal["background"] | None = None,
+    scale: float | str | None = None,
     offset: float = 0.0,
     order: int = 2,
 ) -> Measured:
@@ -104,7 +103,7 @@ def _in_model_unit(
     images: Real[np.ndarray, "focus y x"],
     bias: float | None,
     flatten: bool,
-    scale: float | Literal["background"],
+    scale: float | str,
     offset: float,
     order: int,
     label: str,

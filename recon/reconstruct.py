@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -16,7 +17,7 @@ from tqdm import tqdm
 
 from recon import checkpoint, figures
 from recon.checkpoint import Checkpoint, CheckpointError, Row
-from recon.config import Config, ConfigError, dump, flat
+from recon.config import Config, ConfigError, SimulationSection, dump, flat
 from recon.descend import Step, descend
 from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
@@ -28,6 +29,10 @@ from torchdic.tiff import StackError, read_stack, write_volume
 CHECKPOINT = "checkpoint.pt"
 # Without a [fidelity] section: what a first-order split step lacks is below what condenser directions and voxels leave.
 RECOMMENDED = Fidelity("wave", order=1)
+
+
+class PoorFitWarning(UserWarning):
+    """A descent has ended at a volume that explains its data less than empty medium does."""
 
 
 class InterruptedRunError(Exception):
@@ -78,7 +83,7 @@ def reconstruct(
     config = replace(config, fidelity=fidelity)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
-    identity = "\n".join([*flat(config), f"data's sha256 = {hashlib.sha256(measured.data.tobytes()).hexdigest()}"])
+    identity = _identity(config, measured)
     saved = out / CHECKPOINT
     start: Checkpoint | None = None
     if saved.exists():
@@ -94,9 +99,16 @@ def reconstruct(
         volume = Volume(grid, last.delta, config.volume.background)
         modelled = image(volume, config.microscope, config.acquisition, fidelity).cpu()
     data, delta = data.cpu(), last.delta.cpu()
-    metrics = {"propagation": fidelity.propagation, **_metrics(measured, modelled, data, delta, last)}
+    metrics: dict[str, Any] = {"propagation": fidelity.propagation, **_metrics(measured, modelled, data, delta, last)}
+    if metrics["misfit"] > 1:
+        warnings.warn(
+            f"the misfit {metrics['misfit']:.3g} is above 1: empty medium would explain the stack better; "
+            "a smaller learning_rate or more tv may help",
+            PoorFitWarning,
+            stacklevel=2,
+        )
     write_volume(out / "volume.ome.tif", delta, grid)
-    _write_text(out / "config.toml", dump(config))
+    _write_text(out / "config.resolved.toml", dump(config))
     _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     prisms, focus = config.acquisition.prisms, measured.focus
     figures.save(figures.draw_images(data, modelled, prisms, focus, grid), out / "images.png")
@@ -104,6 +116,18 @@ def reconstruct(
     figures.save(figures.draw_misfit(rows), out / "misfit.png")
     saved.unlink(missing_ok=True)
     return Result(delta, metrics)
+
+
+def _identity(config: Config, measured: Measured) -> str:
+    """What the descent depends on, a line for each value: another of these is another descent."""
+    fit = replace(
+        config,
+        data=None,  # as the descent sees them: by their digest
+        specimen=None,
+        simulation=SimulationSection(),
+        reconstruction=replace(config.reconstruction, checkpoint_every=1),
+    )
+    return "\n".join([*flat(fit), f"data's sha256 = {hashlib.sha256(measured.data.tobytes()).hexdigest()}"])
 
 
 def prepare_folder(out: Path) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import install_import_hook
 
 # int is accepted where float is asked for, as the type checker does (PEP 484's numeric tower).
 install_import_hook(
-    ["torchdic", "data_synthetic"],
+    ["torchdic", "data_synthetic", "recon"],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
 

@@ -28,8 +28,10 @@ def test_presets_are_ordered_by_care():
         ({"steps": 0}, "steps 0 must be at least 1"),
         ({"sources": 0}, "sources 0 must be at least 1"),
         ({"padding": -1}, "padding -1 must be at least 0"),
-        ({"tolerance": 0.0}, r"tolerance 0\.0 must be above 0"),
+        ({"tolerance": 0.0}, r"tolerance 0\.0 must be above 0, and finite"),
         ({"tolerance": math.nan}, "tolerance nan must be above 0"),
+        ({"tolerance": math.inf}, "tolerance inf must be above 0, and finite"),
+        ({"reference_plane": math.nan}, "reference_plane nan must be a finite depth"),
         ({"memory": 0}, "memory 0 must be above 0"),
     ],
 )

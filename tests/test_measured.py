@@ -218,9 +218,7 @@ def test_options_that_mean_nothing_are_refused(option, law):
         prepare(Stack(np.ones((1, 1, 8, 8), np.uint8)), [None], [0.0], (0.1, 0.1), **option)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "bits", "top"), [("uint8", None, 255), ("uint16", 12, 4095), ("int16", 16, 32767)]
-)
+@pytest.mark.parametrize(("dtype", "bits", "top"), [("uint8", None, 255), ("uint16", 12, 4095), ("int16", 16, 32767)])
 def test_saturated_pixels_are_counted(dtype, bits, top):
     data = np.full((1, 1, 20, 20), top // 2, dtype)
     data[0, 0, 0, :4] = top

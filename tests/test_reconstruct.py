@@ -44,7 +44,7 @@ RESULTS = {
     "volume.ome.tif",
     "metrics.json",
     "log.csv",
-    "config.toml",
+    "config.resolved.toml",
     "images.png",
     "sections.png",
     "misfit.png",
@@ -224,12 +224,12 @@ def test_the_log_has_every_step_once(workplace):
 
 def test_the_resolved_configuration_gives_the_same_volume(workplace, tmp_path):
     whole = workplace / "whole"
-    values = tomllib.loads((whole / "config.toml").read_text(encoding="utf-8"))
+    values = tomllib.loads((whole / "config.resolved.toml").read_text(encoding="utf-8"))
     assert values["reconstruction"]["learning_rate"] == 5e-3  # a default, spelled out
-    assert command("reconstruct", whole / "config.toml", "--out", tmp_path / "again")[0] == 0
+    assert command("reconstruct", whole / "config.resolved.toml", "--out", tmp_path / "again")[0] == 0
     assert torch.equal(volume(tmp_path / "again"), volume(whole))
-    again = (tmp_path / "again" / "config.toml").read_bytes()
-    assert again == (whole / "config.toml").read_bytes()
+    again = (tmp_path / "again" / "config.resolved.toml").read_bytes()
+    assert again == (whole / "config.resolved.toml").read_bytes()
 
 
 def test_the_pictures_are_pictures(workplace):
@@ -255,7 +255,7 @@ def test_without_a_fidelity_the_recommended_wave_is_used_and_recorded(workplace,
     values["data"]["path"] = str(workplace / "simulated" / "stack.ome.tif")
     (tmp_path / "plain.toml").write_text(tomli_w.dumps(values), encoding="utf-8")
     assert command("reconstruct", tmp_path / "plain.toml", "--out", tmp_path / "out")[0] == 0
-    assert load(tmp_path / "out" / "config.toml").fidelity == reconstruct.RECOMMENDED
+    assert load(tmp_path / "out" / "config.resolved.toml").fidelity == reconstruct.RECOMMENDED
     assert reconstruct.RECOMMENDED.propagation == "wave"
 
 
@@ -542,6 +542,21 @@ def test_a_changed_configuration_does_not_go_on_with_anothers_run(stopped, other
     assert content(out) == before
 
 
+def test_what_the_descent_does_not_see_may_change_before_it_goes_on(stopped, other, workplace, tmp_path):
+    path, out = stopped
+    assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0
+    moved = tmp_path / "moved.tif"
+    moved.write_bytes((workplace / "simulated" / "stack.ome.tif").read_bytes())
+    changes = {
+        "data": {"path": str(moved)},
+        "reconstruction": {"steps": 8, "checkpoint_every": 2},
+        "specimen": {"contrast": 0.01},
+        "simulation": {"seed": 5},
+    }
+    assert command("reconstruct", other(changes), "--out", out, "--resume")[0] == 0
+    assert torch.equal(volume(out), volume(tmp_path / "whole"))
+
+
 def test_changed_data_do_not_go_on_with_anothers_run(workplace, other, interrupt, tmp_path):
     data = read_stack(workplace / "simulated" / "stack.ome.tif").data.copy()
     write_stack(tmp_path / "data.ome.tif", data)
@@ -557,6 +572,12 @@ def test_changed_data_do_not_go_on_with_anothers_run(workplace, other, interrupt
 
 
 # warnings
+
+
+def test_a_volume_that_explains_less_than_empty_medium_is_warned_of(other, tmp_path):
+    path = other({"reconstruction": {"steps": 3, "learning_rate": 1.0}})
+    with pytest.warns(reconstruct.PoorFitWarning, match="empty medium would explain the stack better"):
+        reconstruct.reconstruct(load(path), tmp_path / "out", torch.device("cpu"))
 
 
 def test_voxels_coarser_than_the_light_are_warned_of_once_and_computed(other, tmp_path):

@@ -36,9 +36,7 @@ def refused(path):
     return False
 
 
-@pytest.fixture(
-    params=["ome", "ome-lzw", "ome-zlib", "imagej", "plain", "plain-lzw", "one-page", "bigtiff", "tiled"]
-)
+@pytest.fixture(params=["ome", "ome-lzw", "ome-zlib", "imagej", "plain", "plain-lzw", "one-page", "bigtiff", "tiled"])
 def tiff(request, tmp_path):
     """A sound stack of 2 prisms × 5 planes in one of the layouts that programs write: (path, data)."""
     data = ramp((2, 5, 16, 16), np.float32)
@@ -50,9 +48,7 @@ def tiff(request, tmp_path):
         write_stack(path, data, (0.2, 0.1), 0.5, compression=codec or None)
     elif kind == "imagej":
         hyperstack = data.transpose(1, 0, 2, 3)
-        tifffile.imwrite(
-            path, hyperstack, imagej=True, metadata={"axes": "ZCYX", "unit": "um", "spacing": 0.5}
-        )
+        tifffile.imwrite(path, hyperstack, imagej=True, metadata={"axes": "ZCYX", "unit": "um", "spacing": 0.5})
     elif kind == "bigtiff":
         tifffile.imwrite(path, data, bigtiff=True, byteorder=">")
     elif kind == "tiled":
@@ -125,9 +121,7 @@ def test_ome_sizes_are_in_micrometres_and_on_the_page_for_readers_without_ome(tm
     assert per_cm == pytest.approx([1e4 / 0.2, 1e4 / 0.1], rel=1e-6)  # a fraction of two 32-bit integers
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("nm", 1e-3), ("µm", 1.0), ("mm", 1e3), ("Å", 1e-4), ("m", 1e6)]
-)
+@pytest.mark.parametrize(("unit", "factor"), [("nm", 1e-3), ("µm", 1.0), ("mm", 1e3), ("Å", 1e-4), ("m", 1e6)])
 def test_ome_units_become_micrometres(tmp_path, unit, factor):
     path = tmp_path / "stack.ome.tif"
     sizes = {"PhysicalSizeX": 3.0, "PhysicalSizeY": 2.0, "PhysicalSizeZ": 5.0}

@@ -45,9 +45,10 @@ def test_background_number_keeps_its_digits():
     assert float(Volume(GRID, field(), 1.36).background) == 1.36
 
 
-def test_mean_plane_is_the_slice_nearest_to_the_weighted_mean_depth():
-    for centre, expected in ((0.75, 0.8), (-0.5, -0.4), (0.0, 0.0)):
-        grid = Grid((15, 12, 12), (0.4, 0.3, 0.3))
+@pytest.mark.parametrize("slices", [15, 16])
+def test_mean_plane_is_the_slice_or_face_nearest_to_the_weighted_mean_depth(slices):
+    for centre, expected in ((0.75, 0.8), (-0.47, -0.4), (0.35, 0.4), (0.25, 0.2), (0.0, 0.0)):
+        grid = Grid((slices, 12, 12), (0.4, 0.3, 0.3))
         delta = GaussianBall(0.5, 0.02, 1.36, (centre, 0.0, 0.3)).delta(grid)
         for sign in (1, -1):
             assert Volume(grid, sign * delta, 1.36).mean_plane() == pytest.approx(expected)

@@ -1,5 +1,6 @@
 """How carefully to compute: the one place where accuracy is traded for time."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -25,8 +26,8 @@ class Fidelity:
     tolerance: largest local error of an adaptive solver, absolute in µm and relative.
     amplitude: whether rays carry their energy's amplitude; False is for studying what it does.
     order: of the split step: 2 (4 FFTs a slab) or 1 (2 FFTs).
-    reference_plane: depth in µm at which rays are turned into a field; None is the slice nearest to the |Δn|-weighted
-        mean depth.
+    reference_plane: depth in µm at which rays are turned into a field; None is the slice's centre or face nearest to
+        the |Δn|-weighted mean depth.
     padding: voxels of the medium around the volume's sides on each side during the computation.
     memory: bytes that one batch of sources may keep for the backward pass; above it slabs and batches are recomputed.
     Raises ValueError where a value breaks its law.
@@ -60,8 +61,10 @@ class Fidelity:
             raise ValueError(f"sources {self.sources} must be at least 1")
         if self.padding < 0:
             raise ValueError(f"padding {self.padding} must be at least 0 voxels")
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance {self.tolerance} must be above 0")
+        if not 0 < self.tolerance < math.inf:
+            raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
+        if self.reference_plane is not None and not math.isfinite(self.reference_plane):
+            raise ValueError(f"reference_plane {self.reference_plane} must be a finite depth in µm")
         if not self.memory > 0:
             raise ValueError(f"memory {self.memory} must be above 0 bytes")
 

@@ -52,13 +52,16 @@ class Volume(nn.Module):
             self.register_buffer(name, value)
 
     def mean_plane(self) -> float:
-        """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre; 0 where Δn is 0 everywhere."""
+        """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 where Δn is 0 everywhere.
+
+        Faces count too: a specimen centred between two slices would be out of focus by half a slice otherwise.
+        """
         weight = self.delta.detach().abs().sum((1, 2), dtype=torch.float64)
         total = float(weight.sum())
         if total == 0:
             return 0.0
         depth = self.grid.coordinates(0, dtype=torch.float64, device=weight.device)
-        index = round(self.grid.index(0, float((weight * depth).sum()) / total))
+        index = round(2 * self.grid.index(0, float((weight * depth).sum()) / total)) / 2
         return self.grid.centre(0, index)
 
 
