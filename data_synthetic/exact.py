@@ -290,11 +290,10 @@ def _radial_waves(
     k0 = 2 * math.pi / wavelength
     k = k0 * n_medium
     # One look at the index on a mesh finer than any wave's sets the number of orders and the default step.
-    largest = _index_at(index, radius * (np.arange(2048) + 0.5) / 2048).max()
-    if step is None:
-        step = wavelength / (100 * max(largest, n_medium))
-    require_above_zero("step", step, "µm")
-    steps = math.ceil(radius / step)
+    largest = float(_index_at(index, radius * (np.arange(2048) + 0.5) / 2048).max())
+    longest = wavelength / (100 * max(largest, n_medium)) if step is None else step
+    require_above_zero("step", longest, "µm")
+    steps = math.ceil(radius / longest)
     h = radius / steps
     orders = _number_of_orders(k0 * max(largest, n_medium) * radius)
 
@@ -330,10 +329,11 @@ def _magnus_steps(orders: int, x: np.ndarray, w: np.ndarray, h: float) -> np.nda
     diagonal = h / 2 * jy.sum(1) + scale * cross * (y[:, 0] * j[:, 1] + j[:, 0] * y[:, 1])
     upper = h / 2 * yy.sum(1) + 2 * scale * cross * y[:, 0] * y[:, 1]
     lower = -h / 2 * jj.sum(1) - 2 * scale * cross * j[:, 0] * j[:, 1]
-    delta = np.sqrt((diagonal**2 + upper * lower).astype(complex))
-    cosh = np.cosh(delta).real
-    small = np.abs(delta) < 1e-8
-    sinhc = np.where(small, 1, np.sinh(delta) / np.where(small, 1, delta)).real
+    squared = diagonal**2 + upper * lower
+    delta = np.sqrt(np.abs(squared))
+    cosh = np.where(squared > 0, np.cosh(delta), np.cos(delta))
+    sinh = np.where(squared > 0, np.sinh(delta), np.sin(delta))
+    sinhc = np.where(delta < 1e-8, 1, sinh / np.maximum(delta, 1e-8))
     return np.stack((cosh + sinhc * diagonal, sinhc * upper, sinhc * lower, cosh - sinhc * diagonal), 1)
 
 
