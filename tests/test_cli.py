@@ -264,7 +264,7 @@ def test_a_reconstruction_without_data_is_refused(write, refused):
         ({"specimen.sigma": -1.0}, ["specimen", "sigma -1.0", "above 0"]),
         ({"specimen.contrast": -1.0}, ["specimen", "1.5", "-1.0", "at least 1"]),
         ({"specimen.background": 1.4}, ["specimen.background 1.4", "volume.background 1.5"]),
-        ({"simulation.exact": True}, ["simulation.exact", "isn't known"]),
+        ({"specimen": {"kind": "cell"}, "simulation.exact": True}, ["simulation.exact", "isn't known"]),
     ],
 )
 def test_a_specimen_that_cannot_be_used_is_refused(write, refused, changes, words):
