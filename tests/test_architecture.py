@@ -29,6 +29,7 @@ LAYERS = (
     "objective",
     "camera",
     "microscope",
+    "weak",
     "plan",
     "precision",
     "tiff",
