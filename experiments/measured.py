@@ -4,7 +4,8 @@
 
 Without IMAGE it takes the one that measured.toml names, from the folder in the environment variable TORCHDIC_DATA.
 The optics in measured.toml are guesses, so the phase has an arbitrary scale, and since shear and bias reversed
-together give the same image, an arbitrary sign. What the image shows, and this finds, is where the phase is and how it is shaped.
+together give the same image, an arbitrary sign. What the image shows, and this finds, is where the phase is and how it
+is shaped.
 """
 
 import argparse

@@ -345,6 +345,22 @@ def test_strong_balls_are_finite_lose_no_light_and_obey_the_optical_theorem(name
     forward = radial_amplitude(torch.ones(1, dtype=torch.float64), WAVELENGTH, index, radius, n0)[0]
     scattered = 2 * np.pi * weights @ np.abs(f) ** 2
     assert scattered == pytest.approx(2 * WAVELENGTH / n0 * float(forward.imag), rel=1e-10)
+    points = torch.stack((AXIAL, OBLIQUE))
+    field = radial_field(Grid((1, 24, 20), (0.3, 0.3, 0.3)), WAVELENGTH, index, radius, n0, points, na=1.0)
+    assert bool(torch.isfinite(torch.view_as_real(field)).all())
+    assert rms(field - 1) > 0.1
+
+
+@pytest.mark.parametrize("contrast", [0.03, 0.1])
+def test_power_behind_a_smooth_ball_is_the_source_s(contrast):
+    # It reflects nothing, so that the forward waves carry all; a smooth spectrum sums to rounding (1e-15).
+    grid, n0 = Grid((1, 128, 128), (0.2, 0.2, 0.2)), 1.36
+    field = GaussianBall(1.0, contrast, n0).field(grid, WAVELENGTH, OBLIQUE[None], padding=1.0)[0]
+    spectrum = torch.fft.fft2(field, norm="forward")
+    f = grid.frequencies(dtype=torch.float64) + OBLIQUE[:, None, None] / WAVELENGTH
+    pz = ((n0 / WAVELENGTH) ** 2 - f.square().sum(0)).clamp_min(0).sqrt()
+    flux = float((pz * spectrum.abs() ** 2).sum() / pz[0, 0])
+    assert flux == pytest.approx(1, abs=1e-13)
 
 
 def test_field_of_a_ball_is_radial_field_s_about_its_centre():
