@@ -5,10 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.misfit import spatial_variance
-from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
+from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume
+from torchdic.weak import linear_image, transfer_functions
 
-# Small enough that the image responds linearly, large enough for float32: 3e-4 · 0.4 µm is 1e-3 rad.
-PROBE = 3e-4
 # Tikhonov weight relative to the mean response.
 DAMPING = 0.03
 
@@ -22,28 +21,22 @@ def linear_start(
     acquisition: Acquisition,
     sources: int = 24,
 ) -> Float[Tensor, "z y x"]:
-    """Δn that the model's own linear response at Δn = 0 finds behind the data.
+    """Δn that the model's linear response at Δn = 0 finds behind the data; 0 where it has none, as with bias 0 alone.
 
-    The response to one voxel of each slice is computed by the wave rung; then, frequency by frequency, a damped
-    least-squares problem of the size of the number of slices is solved.
+    Frequency by frequency, a damped least-squares problem of the size of the number of slices is solved with the wave's
+    transfer function.
     """
-    fidelity = Fidelity("wave", order=1, sources=sources)
-    empty = torch.zeros(grid.shape, dtype=data.dtype, device=data.device)
-
-    def response(delta: Tensor) -> Tensor:
-        return image(Volume(grid, delta, background), microscope, acquisition, fidelity)
-
-    background_image = response(empty)
+    fidelity = Fidelity("wave", sources=sources)
+    empty = Volume(grid, data.new_zeros(grid.shape), background)
     weights = spatial_variance(data).rsqrt()[:, None, None, None]
-    transfers = []
-    for z in range(grid.shape[0]):
-        probe = empty.clone()
-        probe[z, 0, 0] = PROBE
-        transfers.append(torch.fft.fft2(weights * (response(probe) - background_image) / PROBE).flatten(0, 1))
-    H = torch.stack(transfers, -1).permute(1, 2, 0, 3)  # (y, x, prism·focus, z)
-    d = torch.fft.fft2(weights * (data - background_image)).flatten(0, 1).permute(1, 2, 0)[..., None]
+    transfer = transfer_functions(
+        grid, microscope, acquisition, background, fidelity, dtype=data.dtype, device=data.device
+    )
+    H = (weights[..., None] * transfer).flatten(0, 1).permute(2, 3, 0, 1)  # (y, x, prism·focus, z)
+    deviation = data - linear_image(empty, microscope, acquisition, fidelity)
+    d = torch.fft.fft2(weights * deviation).flatten(0, 1).permute(1, 2, 0)[..., None]
     normal = H.mH @ H
-    scale = normal.diagonal(dim1=-2, dim2=-1).real.mean()
-    damped = normal + DAMPING * scale * torch.eye(grid.shape[0], dtype=data.dtype, device=data.device)
-    spectrum = torch.linalg.solve(damped, H.mH @ d)[..., 0]
+    scale = normal.diagonal(dim1=-2, dim2=-1).real.mean().clamp_min(torch.finfo(data.dtype).tiny)
+    damped = normal / scale + DAMPING * torch.eye(grid.shape[0], dtype=data.dtype, device=data.device)
+    spectrum = torch.linalg.solve(damped, H.mH @ d / scale)[..., 0]
     return torch.fft.ifft2(spectrum.movedim(-1, 0)).real

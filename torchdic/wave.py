@@ -17,6 +17,9 @@ from torchdic.rays import axial_momentum
 from torchdic.recompute import recompute, slabs
 from torchdic.volume import Volume
 
+# Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices.
+LOWEST_PZ = 0.1
+
 
 def axial_difference(
     grid: Grid, wavelength: float, background: Tensor, momentum: Float[Tensor, "source 2"]
@@ -72,7 +75,7 @@ def split_step(
 
     difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
     H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
-    excess = pz0 / pz.clamp_min(0.1) - 1
+    excess = pz0 / pz.clamp_min(LOWEST_PZ) - 1
 
     def screen(step: int) -> Tensor:
         n = n0 + slab_mean(deltas, step, steps)

@@ -30,10 +30,7 @@ from torchdic.microscope import Acquisition, Microscope, check_apertures
 from torchdic.prism import Prism
 from torchdic.recompute import sum_over_sources
 from torchdic.volume import Volume
-from torchdic.wave import axial_difference, exp_i, to_field, to_spectrum
-
-# The split step's floor of p_z in the angle's factor 1/p_z, which is unbounded for waves that graze the slices.
-LOWEST_PZ = 0.1
+from torchdic.wave import LOWEST_PZ, axial_difference, exp_i, to_field, to_spectrum
 
 
 def two_beam_image(phase: Float[Tensor, "y x"], grid: Grid, prism: Prism) -> Float[Tensor, "y x"]:
