@@ -105,3 +105,86 @@ def test_errors_state_the_numbers_and_the_law(arguments, message):
 def test_no_sources_are_an_error():
     with pytest.raises(ValueError, match="at least 1 source, not 0"):
         Condenser(0.5).sources(0)
+
+
+# --- annulus -------------------------------------------------------------------------------------------------------
+
+
+def annulus_mean(p, q, hole):
+    """The mean of y^p·x^q over hole ≤ r ≤ 1: the disc's less the inner disc's, by area."""
+    return disc_mean(p, q) * (1 - hole ** (p + q + 2)) / (1 - hole**2)
+
+
+@pytest.mark.parametrize("hole", [0.3, 0.7, 0.95])
+@pytest.mark.parametrize("count", [2, 5, 12, 40, 120])
+def test_annulus_lies_between_its_radii_with_weights_of_sum_one(hole, count, dtype):
+    points, weights = Condenser(0.8, inner_na=0.8 * hole).sources(count, dtype=dtype)
+    radius = points.norm(dim=-1)
+    assert 2 <= len(weights) <= count
+    assert float(radius.min()) >= 0.8 * hole * (1 - 1e-6)
+    assert float(radius.max()) <= 0.8 * (1 + 1e-6)
+    assert float(weights.min()) > 0
+    assert float(weights.sum()) == pytest.approx(1, abs=4 * torch.finfo(dtype).eps)
+    torch.testing.assert_close(weights @ points, torch.zeros(2, dtype=dtype), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("hole", [0.2, 0.6, 0.9])
+@pytest.mark.parametrize(("count", "degree"), [(12, 3), (40, 7), (120, 10)])
+def test_annulus_quadrature_is_exact_for_polynomials(hole, count, degree):
+    points, weights = disc_quadrature(count, hole)
+    # fewer rings suffice where the annulus is narrow: there their error is not zero but below 1e-4
+    tolerance = 1e-13 if hole < 0.5 else 1e-4
+    for p in range(degree + 1):
+        for q in range(degree + 1 - p):
+            found = (weights * points[:, 0] ** p * points[:, 1] ** q).sum()
+            assert found == pytest.approx(annulus_mean(p, q, hole), abs=tolerance), (p, q)
+
+
+def test_inner_aperture_of_zero_is_the_disc_exactly():
+    for found, expected in zip(Condenser(0.6, inner_na=0.0).sources(40), Condenser(0.6).sources(40), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_equal_apertures_are_one_ring_to_which_narrow_annuli_tend():
+    points, weights = Condenser(0.6, inner_na=0.6).sources(31, dtype=torch.float64)
+    torch.testing.assert_close(points.norm(dim=-1), torch.full((31,), 0.6, dtype=torch.float64))
+    assert len(weights.unique()) == 1
+    narrow, _ = Condenser(0.6, inner_na=0.6 * (1 - 1e-7)).sources(31, dtype=torch.float64)
+    torch.testing.assert_close(narrow, points, rtol=0, atol=1e-7)
+
+
+def test_annulus_and_its_inner_disc_make_the_full_disc():
+    """Images weighted by area, to the quadratures' error, which the pupil's sharp edge sets."""
+    grid = Grid((6, 30, 32), (0.4, 0.18, 0.18))
+    volume = Volume(grid, GaussianBall(0.6, 0.02, 1.36, (0.3, -0.2, 0.4)).delta(grid), 1.36)
+    acquisition = Acquisition([Prism((0.1, 0.2), 1.2)], [0.0, 1.5])
+
+    def of(condenser, sources):
+        return image(
+            volume, Microscope(0.546, Objective(0.8), condenser), acquisition, Fidelity("wave", sources=sources)
+        )
+
+    ring, inner, disc = of(Condenser(0.6, inner_na=0.4), 120), of(Condenser(0.4), 120), of(Condenser(0.6), 200)
+    share = (0.4 / 0.6) ** 2
+    contrast = float((disc - math.sin(0.6) ** 2).abs().max())
+    assert float((share * inner + (1 - share) * ring - disc).abs().max()) < 5e-3 * contrast
+    assert float((ring - disc).abs().max()) > 0.02 * contrast
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"na": 0.5, "inner_na": 0.6}, r"inner NA 0\.6 must be from 0 to its NA 0\.5"),
+        ({"na": 0.5, "inner_na": -0.1}, r"inner NA -0\.1 must be from 0"),
+        ({"na": 0.5, "inner_na": math.nan}, r"inner NA nan must be from 0"),
+        ({"na": 0.5, "inner_na": 0.1, "points": torch.zeros(1, 2)}, r"inner NA 0\.1 would stop given points"),
+    ],
+)
+def test_impossible_annuli_are_errors(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Condenser(**arguments)
+
+
+def test_single_source_of_an_annulus_is_an_error():
+    with pytest.raises(ValueError, match="at least 2 sources, not 1"):
+        Condenser(0.5, inner_na=0.3).sources(1)

@@ -14,16 +14,26 @@ class Condenser:
 
     na: its numerical aperture; 0 is one axial plane wave. points: directions (source, 2), each n·(sinθ_y, sinθ_x) as
     given, in place of the disc of `na`. weights: their shares (source,), made to sum to 1; None means equal ones.
-    Raises ValueError for a negative aperture or weight, weights without points, or unequal numbers of the two.
+    inner_na: the aperture below which a ring stop blocks the light; None is a disc, `na` itself a ring.
+    Raises ValueError for a negative aperture or weight, weights without points, unequal numbers of the two, and an
+    inner aperture above `na` or beside points.
     """
 
     na: float
     points: Float[Tensor, "source 2"] | None = None
     weights: Float[Tensor, " source"] | None = None
+    inner_na: float | None = None
 
     def __post_init__(self) -> None:
         if not (0 <= self.na < float("inf")):
             raise ValueError(f"condenser NA {self.na} must be at least 0")
+        if self.inner_na is not None:
+            if not (0 <= self.inner_na <= self.na):
+                raise ValueError(f"condenser inner NA {self.inner_na} must be from 0 to its NA {self.na}")
+            if self.points is not None:
+                raise ValueError(
+                    f"condenser inner NA {self.inner_na} would stop given points: leave out those it stops"
+                )
         if self.points is None:
             if self.weights is not None:
                 raise ValueError("condenser weights need the points that they belong to")
@@ -52,29 +62,38 @@ class Condenser:
         elif self.na == 0:
             points, weights = torch.zeros(1, 2), torch.ones(1)
         else:
-            points, weights = (torch.from_numpy(a) for a in disc_quadrature(count))
+            hole = 0.0 if self.inner_na is None else self.inner_na / self.na
+            points, weights = (torch.from_numpy(a) for a in disc_quadrature(count, hole))
             points = points * self.na
         points = points.to(device, dtype or torch.get_default_dtype())
         weights = weights.to(device, torch.float64)
         return points, (weights / weights.sum()).to(points.dtype)
 
 
-def disc_quadrature(count: int) -> tuple[np.ndarray, np.ndarray]:
+def disc_quadrature(count: int, hole: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 2) in the unit disc and weights (m,) that sum to 1, m ≤ count, for the mean over the disc.
 
     K rings at the Gauss nodes of r², each with M equally spaced azimuths: exact for polynomials of degree below
     min(4K, M). The rings are turned by half a step against each other, so that what their azimuths miss beyond that, up
     to about 2M, nearly cancels: K and M are chosen for it, and where they tie more rings are.
+    hole: radius from 0 to 1 within which there is no light; the nodes then lie between hole² and 1, and the narrower
+    that interval, the fewer rings it takes.
+    Raises ValueError for no sources, or a single one where there is a hole, which would light from one side.
     """
     if count < 1:
         raise ValueError(f"a condenser needs at least 1 source, not {count}")
     if count == 1:
+        if hole > 0:
+            raise ValueError("an annular condenser needs at least 2 sources, not 1: a single one lights from one side")
         return np.zeros((1, 2)), np.ones(1)
+    width = 1 - hole**2
+    fitting = range(1, (count if hole == 0 else count // 2) + 1) if width > 0 else (1,)
     rings, azimuths = max(
-        ((k, count // k) for k in range(1, count + 1)), key=lambda rule: (min(2 * rule[0], rule[1]), rule[0])
+        ((k, count // k) for k in fitting),
+        key=lambda rule: (min(2 * rule[0] / width, rule[1]) if width > 0 else 0, rule[0]),
     )
     nodes, node_weights = np.polynomial.legendre.leggauss(rings)
-    radius = np.sqrt((1 + nodes) / 2)
+    radius = np.sqrt(hole**2 + width * ((1 + nodes) / 2))
     angle = 2 * np.pi * (np.arange(azimuths)[None, :] + 0.5 * (np.arange(rings)[:, None] % 2)) / azimuths
     points = np.stack((radius[:, None] * np.sin(angle), radius[:, None] * np.cos(angle)), -1).reshape(-1, 2)
     return points, np.repeat(node_weights / 2 / azimuths, azimuths)
