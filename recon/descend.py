@@ -34,8 +34,8 @@ class Recipe:
 
     steps: int = 150
     learning_rate: float = 5e-3
-    tv: tuple[float, float] = (100.0, 10.0)
-    l1: float = 1.0
+    tv: tuple[float, float] = (60.0, 5.0)
+    l1: float = 0.5
     bounds: Bounds = field(default_factory=Bounds)
     start: Literal["linear", "zero"] = "linear"
     draft_sources: int | None = 24

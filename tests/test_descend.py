@@ -56,7 +56,7 @@ def alike(a, b):
 
 
 def test_the_misfit_falls_fiftyfold_and_the_error_with_it(truth):
-    steps = run(seen(truth), Recipe(steps=60, start="zero"))
+    steps = run(seen(truth), Recipe(steps=60, start="zero", tv=(100.0, 10.0), l1=1.0))
     assert steps[0].misfit > 0.5  # the volume before the first step is nearly empty
     assert steps[-1].misfit < 0.02 * steps[0].misfit
     errors = [volume_error(step.delta, truth) for step in steps]

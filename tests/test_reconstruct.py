@@ -526,7 +526,7 @@ def test_an_interruption_among_the_results_goes_on_from_the_last_checkpoint(othe
     ("changes", "named"),
     [
         ({"reconstruction": {"steps": 9}}, "reconstruction.steps was 8, is 9"),
-        ({"reconstruction": {"steps": 8, "tv": [50.0, 5.0]}}, "reconstruction.tv was [100.0, 10.0], is [50.0, 5.0]"),
+        ({"reconstruction": {"steps": 8, "tv": [50.0, 5.0]}}, "reconstruction.tv was [60.0, 5.0], is [50.0, 5.0]"),
         ({"reconstruction": {"steps": 8, "bounds": {"lower": "none"}}}, "bounds.lower was 0.0, is 'none'"),
         ({"volume": {"background": 1.51}}, "volume.background was 1.5, is 1.51"),
         ({"fidelity": {"sources": 6, "order": 2}}, "fidelity.order was 1, is 2"),
