@@ -14,7 +14,7 @@ from torchdic.condenser import Condenser
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
 from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
-from torchdic.objective import Objective
+from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace
 from torchdic.volume import Volume
@@ -28,14 +28,17 @@ __all__ = [
     "Condenser",
     "Fidelity",
     "Grid",
+    "Layer",
     "Microscope",
     "Objective",
     "Prism",
     "Rays",
     "SamplingWarning",
+    "ThinLens",
     "Volume",
     "image",
     "image_field",
     "launch",
+    "thin_lens",
     "trace",
 ]

@@ -181,9 +181,9 @@ def form_image(
     if microscope.objective is not None:
         waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
         passes = passes & microscope.objective.aperture(waves)
-        phase = microscope.objective.phase(waves)
-        if phase is not None:
-            spectrum = spectrum * exp_i(phase)
+        pupil = microscope.objective.transfer(waves, momentum, microscope.wavelength, background)
+        if pupil is not None:
+            spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
     transfers = [None if prism is None else prism.transfer(frequencies) for prism in acquisition.prisms]
     images = []

@@ -1,12 +1,59 @@
-"""The objective's pupil: aperture and Zernike aberrations."""
+"""The objective: lens law, and its pupil's aperture, Zernike aberrations, apodisation and a layer not designed for."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
+
+from torchdic.wave import exp_i
+
+# Relative difference up to which more lengths than the lens law needs count as agreeing.
+_AGREE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A plane-parallel layer between specimen and objective where the objective's design expects another index.
+
+    A cover glass too thick or too thin, or light that is focused some depth into a medium other than the immersion.
+    thickness: µm; below 0 where that much of the layer is missing. index: of the layer. design_index: of what the
+    design has in its place. Numbers or 0-d tensors, which are learned. Raises ValueError for a thickness that isn't
+    finite or an index below 1.
+    """
+
+    thickness: float | Tensor
+    index: float | Tensor
+    design_index: float | Tensor
+
+    def __post_init__(self) -> None:
+        thickness = _number(self.thickness)
+        if not math.isfinite(thickness):
+            raise ValueError(f"layer thickness {thickness} µm must be a finite number")
+        for name, value in (("index", _number(self.index)), ("design_index", _number(self.design_index))):
+            if not (1 <= value < math.inf):
+                raise ValueError(f"layer {name} {value} must be a refractive index of at least 1")
+
+    def phase(self, momentum: Float[Tensor, "source 2 y x"], wavelength: float) -> Float[Tensor, "source y x"]:
+        """k0·t·(√(n² − |p|²) − √(n_d² − |p|²)) in rad at each transverse momentum p; 0 where either is evanescent.
+
+        It is exact, and whole: it keeps its piston k0·t·(n − n_d), which no image shows, and its defocus, by which for
+        small angles the plane z_f + t·n0·(1/n − 1/n_d) is sharp instead of z_f. Beyond these it is the spherical
+        aberration of Gibson & Lanni, J. Opt. Soc. Am. A 8, 1601 (1991).
+        """
+        t, n, design = (
+            torch.as_tensor(v, dtype=momentum.dtype, device=momentum.device)
+            for v in (self.thickness, self.index, self.design_index)
+        )
+        transverse = momentum.square().sum(1)
+        propagates = (transverse < n.square()) & (transverse < design.square())
+        transverse = torch.where(propagates, transverse, 0)  # keeps roots of negative numbers out of the gradient
+        roots = (n.square() - transverse).sqrt() + (design.square() - transverse).sqrt()
+        # the difference of the roots without cancellation
+        return torch.where(propagates, 2 * math.pi / wavelength * t * (n - design) * (n + design) / roots, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,12 +61,16 @@ class Objective:
     """An objective.
 
     na: numerical aperture. aberrations: Zernike coefficients {Noll index: rad}, rms phase over the pupil; numbers or
-    0-d tensors, which are learned; None for a perfect lens.
-    Raises ValueError for an aperture that isn't positive or a Noll index below 1.
+    0-d tensors, which are learned; None for a perfect lens. apodisation: "aplanatic" for lenses that obey the sine
+    condition and conserve energy, see `apodise`; None for a pupil of even transmission. layer: what the light crosses
+    though the design expects another index; None where the design is met.
+    Raises ValueError for an aperture that isn't positive or beyond the layer's indices, or a Noll index below 1.
     """
 
     na: float
     aberrations: Mapping[int, float | Tensor] | None = None
+    apodisation: Literal["aplanatic"] | None = None
+    layer: Layer | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.na < float("inf")):
@@ -30,6 +81,12 @@ class Objective:
             coefficient = float(torch.as_tensor(value, dtype=torch.float64).detach())
             if not math.isfinite(coefficient):
                 raise ValueError(f"aberration {index}: {coefficient} rad must be a finite number")
+        if self.apodisation not in (None, "aplanatic"):
+            raise ValueError(f"apodisation {self.apodisation!r} must be 'aplanatic' or absent")
+        if self.layer is not None:
+            lowest = min(_number(self.layer.index), _number(self.layer.design_index))
+            if self.na > lowest:
+                raise ValueError(f"objective NA {self.na:g} exceeds the layer's index {lowest:g}")
 
     def aperture(self, momentum: Float[Tensor, "source 2 y x"]) -> Tensor:
         """Which transverse momenta n·sinθ the pupil lets through, shape (source, y, x); its edge counts as inside."""
@@ -47,6 +104,107 @@ class Objective:
             for index, value in self.aberrations.items()
         ]
         return torch.stack(terms).sum(0)
+
+    def transfer(
+        self,
+        momentum: Float[Tensor, "source 2 y x"],
+        direct: Float[Tensor, "source 2"],
+        wavelength: float,
+        background: Tensor,
+    ) -> Float[Tensor, "source y x"] | Complex[Tensor, "source y x"] | None:
+        """What multiplies the field's spectrum within the aperture; None: nothing does.
+
+        momentum: n·sinθ of the field's waves, direct: of each source's own one. wavelength: in vacuum, µm. background:
+        index of the medium.
+        """
+        phases = [self.phase(momentum), None if self.layer is None else self.layer.phase(momentum, wavelength)]
+        present = [phase for phase in phases if phase is not None]
+        amplitude = None if self.apodisation is None else apodise(momentum, direct, background)
+        if not present:
+            return amplitude
+        transfer = exp_i(present[0] if len(present) == 1 else present[0] + present[1])
+        return transfer if amplitude is None else transfer * amplitude
+
+
+def apodise(
+    momentum: Float[Tensor, "source 2 y x"], direct: Float[Tensor, "source 2"], background: Tensor
+) -> Float[Tensor, "source y x"]:
+    """The aplanatic amplitude √(cosθ/cosθ0) of each wave at θ that an illuminating wave at θ0 excites.
+
+    Detection: a plane wave of amplitude A carries the flux |A|²·cosθ through a plane of focus, and behind the objective
+    all of it along the axis: A gains √cosθ (Richards & Wolf, Proc. R. Soc. A 253, 358, 1959; a point source's waves
+    have the amplitude 1/cosθ by Weyl's expansion, so that they fill a pupil as 1/√cosθ). Illumination: an evenly lit
+    pupil of an aplanatic condenser sends equal flux in every direction n·sinθ0, of the amplitude 1/√cosθ0. The direct
+    light gains 1, so an empty field is what it is without. 0 where a wave is evanescent.
+    """
+    squared = background**2 - momentum.square().sum(1)
+    squared0 = background**2 - direct.square().sum(-1)
+    propagates = squared > 0
+    ratio = torch.where(propagates, squared, 1) / squared0[:, None, None]
+    return torch.where(propagates, ratio.sqrt().sqrt(), 0)
+
+
+@dataclass(frozen=True)
+class ThinLens:
+    """A thin lens that forms a real image: 1/f = 1/a + 1/b and M = b/a; `thin_lens` finds it from any two of them.
+
+    focal_length f, object_distance a, image_distance b: µm. magnification M: of the image, which is inverted.
+    Raises ValueError where one isn't positive, or they break a law.
+    """
+
+    focal_length: float
+    object_distance: float
+    image_distance: float
+    magnification: float
+
+    def __post_init__(self) -> None:
+        f, a, b, m = self.focal_length, self.object_distance, self.image_distance, self.magnification
+        for name, value in vars(self).items():
+            if not (0 < value < math.inf):
+                raise ValueError(f"{name} {value:g} must be above 0: the lens law 1/f = 1/a + 1/b forms no real image")
+        if not math.isclose(1 / f, 1 / a + 1 / b, rel_tol=_AGREE):
+            raise ValueError(
+                f"lens law 1/f = 1/a + 1/b: 1/{f:g} isn't 1/{a:g} + 1/{b:g}, it calls for f {a * b / (a + b):g}"
+            )
+        if not math.isclose(m, b / a, rel_tol=_AGREE):
+            raise ValueError(f"magnification M = b/a: {m:g} isn't {b:g}/{a:g} = {b / a:g}")
+
+
+def thin_lens(
+    *,
+    focal_length: float | None = None,
+    object_distance: float | None = None,
+    image_distance: float | None = None,
+    magnification: float | None = None,
+) -> ThinLens:
+    """The thin lens of two or more of its lengths (µm) and magnification, by 1/f = 1/a + 1/b and M = b/a.
+
+    Raises ValueError for fewer than two, for lengths that form no real image, and for more that contradict each other.
+    """
+    f, a, b, m = focal_length, object_distance, image_distance, magnification
+    given = {"focal_length": f, "object_distance": a, "image_distance": b, "magnification": m}
+    known = {name: value for name, value in given.items() if value is not None}
+    if len(known) < 2:
+        raise ValueError(f"the lens law needs two of {', '.join(given)}; {len(known)} given")
+    for name, value in known.items():
+        if not (0 < value < math.inf):
+            raise ValueError(f"{name} {value:g} must be above 0")
+    for name, distance in (("object_distance", a), ("image_distance", b)):
+        if f is not None and distance is not None and distance <= f:
+            raise ValueError(
+                f"{name} {distance:g} must be above the focal length {f:g}: 1/f = 1/a + 1/b forms no real image"
+            )
+    if f is not None and a is None:
+        a = f * (1 + 1 / known["magnification"]) if b is None else f * b / (b - f)
+    elif a is None:
+        a = known["image_distance"] / known["magnification"]
+    if b is None:
+        b = f * a / (a - f) if m is None and f is not None else a * known["magnification"]
+    return ThinLens(a * b / (a + b) if f is None else f, a, b, b / a if m is None else m)
+
+
+def _number(value: float | Tensor) -> float:
+    return float(torch.as_tensor(value, dtype=torch.float64).detach())
 
 
 def zernike(noll: int, rho: Tensor, theta: Tensor) -> Tensor:

@@ -155,9 +155,9 @@ def _kernel(
         if microscope.objective is not None:
             waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
             pupil = pupil * microscope.objective.aperture(waves)
-            phase = microscope.objective.phase(waves)
-            if phase is not None:
-                pupil = pupil * exp_i(phase)
+            transfer = microscope.objective.transfer(waves, momentum, microscope.wavelength, background)
+            if transfer is not None:
+                pupil = pupil * transfer
         # the unscattered wave, f = 0: sources that miss the pupil have no cross term
         cross = weights[:, None, None] * pupil[:, :1, :1].conj() * pupil * (background / pz.clamp_min(LOWEST_PZ))
         # exp(ik0(z_f − z)q) is a product: a matrix product over the sources sums them for all foci and slices
