@@ -23,7 +23,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.descend import Recipe
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Layer, Microscope, Objective, Prism
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Layer, Microscope, Objective, Polarisation, Prism
 from torchdic.microscope import check_apertures
 
 T = TypeVar("T")
@@ -317,7 +317,9 @@ _hooks: dict[type, dict[str, Callable[[Any, Any], Any]]] = {
     Prism: {"shear": lambda value, _: _tuple(value, tuple[float, float]), "bias": _number},
     Objective: {"aberrations": _aberrations},
     Layer: dict.fromkeys(("thickness", "index", "design_index"), _number),
+    Polarisation: {field.name: _number for field in dataclasses.fields(Polarisation)},
     Condenser: {"points": _tensor, "weights": _tensor},
+    Spectrum: dict.fromkeys(("wavelengths", "weights"), _sequence_of(_number)),
     Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},
     DataSection: {"scale": _scale},
 }

@@ -10,9 +10,10 @@ beams. Intensity is relative to the empty bright field, so an empty DIC image eq
 """
 
 from torchdic.camera import Camera
-from torchdic.condenser import Condenser
+from torchdic.condenser import Condenser, Spectrum
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
+from torchdic.jones import Polarisation
 from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.prism import Prism
@@ -31,9 +32,11 @@ __all__ = [
     "Layer",
     "Microscope",
     "Objective",
+    "Polarisation",
     "Prism",
     "Rays",
     "SamplingWarning",
+    "Spectrum",
     "ThinLens",
     "Volume",
     "image",

@@ -11,9 +11,10 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.camera import Camera
-from torchdic.condenser import Condenser
+from torchdic.condenser import Condenser, Spectrum
 from torchdic.fidelity import STANDARD, Fidelity
 from torchdic.grid import Grid
+from torchdic.jones import Polarisation
 from torchdic.landing import ray_field
 from torchdic.objective import Objective
 from torchdic.prism import Prism
@@ -34,8 +35,11 @@ class SamplingWarning(UserWarning):
 class Microscope:
     """What the microscope is.
 
-    wavelength: in vacuum, µm. objective: None lets every propagating wave through. condenser: None is one axial plane
-    wave. camera: what it records of an image; the images of `image` are noiseless all the same.
+    wavelength: in vacuum, µm; of a spectrum the nominal one, in which nothing is computed. objective: None lets every propagating wave through. condenser: None is one axial plane
+    wave. camera: what it records of an image; the images of `image` are noiseless all the same. polarisation: None is
+    ideal crossed polarisers. condenser_prism: whether a second prism in front of the condenser makes up for each
+    source's tilt, as in Nomarski's microscope; without it the beams of an oblique source differ by 2π f_s·s more, and
+    a wide condenser washes the contrast out, by 2J1(a)/a with a = 2π|s|NA_c/λ.
     Raises ValueError for a wavelength that isn't positive.
     """
 
@@ -43,16 +47,32 @@ class Microscope:
     objective: Objective | None = None
     condenser: Condenser | None = None
     camera: Camera | None = None
+    spectrum: Spectrum | None = None
+    polarisation: Polarisation | None = None
+    condenser_prism: bool = True
 
     def __post_init__(self) -> None:
         if not (0 < self.wavelength < float("inf")):
             raise ValueError(f"wavelength {self.wavelength} µm must be above 0")
+        if self.spectrum is not None:
+            low, high = min(self.spectrum.wavelengths), max(self.spectrum.wavelengths)
+            if not (low <= self.wavelength <= high):
+                raise ValueError(f"wavelength {self.wavelength} µm lies outside its spectrum, {low} to {high} µm")
 
     @property
     def reach(self) -> float:
         """The largest transverse momentum that an image's envelope can hold, NA_o + NA_c."""
         condenser = 0.0 if self.condenser is None else self.condenser.na
         return condenser + (0.0 if self.objective is None else self.objective.na)
+
+    def colours(self) -> list[tuple["Microscope", float]]:
+        """A microscope of one wavelength for each of the light's, with its share; the shares sum to 1."""
+        if self.spectrum is None:
+            return [(self, 1.0)]
+        return [
+            (replace(self, wavelength=wavelength, spectrum=None), share)
+            for wavelength, share in zip(self.spectrum.wavelengths, self.spectrum.shares, strict=True)
+        ]
 
     def sources(
         self, fidelity: Fidelity, *, dtype: torch.dtype, device: torch.device
@@ -94,6 +114,18 @@ def image(
     """
     check_apertures(microscope, float(volume.background.detach()))
     _check_sampling(microscope, volume.grid)
+    if microscope.spectrum is None:
+        return _image(volume, microscope, acquisition, fidelity)
+    colours = microscope.colours()
+    fidelity = replace(fidelity, memory=max(1, fidelity.memory // len(colours)))
+    images = [share * _image(volume, part, acquisition, fidelity) for part, share in colours]
+    return images[0] if len(images) == 1 else torch.stack(images).sum(0)
+
+
+def _image(
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
+) -> Float[Tensor, "prism focus y x"]:
+    """`image` in light of one wavelength."""
     pad = fidelity.padding
     volume = _padded(volume, pad)
     momentum, weights = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
@@ -107,7 +139,7 @@ def image(
         spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity)
         return form_image(spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition)
 
-    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(acquisition)
+    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition)
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
     return _cropped(total, pad)
 
@@ -135,8 +167,14 @@ def image_field(
 
     transmission: (y, x), the same for every source, or (source, y, x), each source's own envelope (its tilt removed) in
     the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
-    the medium. Raises ValueError as `image` does, and where a shape is not the grid's.
+    the medium. Raises ValueError as `image` does, where a shape is not the grid's, and for light of a spectrum, in each
+    of whose wavelengths a transmission is another one.
     """
+    if microscope.spectrum is not None:
+        raise ValueError(
+            f"a transmission belongs to one wavelength, the spectrum has {len(microscope.spectrum.wavelengths)}: "
+            "sum the images over Microscope.colours()"
+        )
     check_apertures(microscope, float(torch.as_tensor(background, dtype=torch.float64).detach()))
     _check_sampling(microscope, grid)
     if not transmission.is_complex():
@@ -155,7 +193,7 @@ def image_field(
         return form_image(spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition)
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
-    kept = _kept_by_imaging(acquisition)
+    kept = _kept_by_imaging(microscope, acquisition)
     total = sum_over_sources(intensity, (momentum, weights, own), own[0].numel(), kept, fidelity.memory)
     return _cropped(total, pad)
 
@@ -172,7 +210,8 @@ def form_image(
 ) -> Float[Tensor, "prism focus y x"]:
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
 
-    Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f.
+    Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f if a condenser prism
+    makes up for the tilt.
     """
     k0 = 2 * math.pi / microscope.wavelength
     frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
@@ -185,21 +224,32 @@ def form_image(
         if pupil is not None:
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
+    if not microscope.condenser_prism:
+        frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
+    polarisation = microscope.polarisation
+    if polarisation is not None and polarisation.ideal:
+        polarisation = None
     transfers = [None if prism is None else prism.transfer(frequencies) for prism in acquisition.prisms]
     images = []
     for focus in acquisition.focus:
         sharp = spectrum * exp_i(
             k0 * (torch.as_tensor(focus, dtype=difference.dtype, device=difference.device) - plane) * difference
         )
-        for transfer in transfers:
+        for prism, transfer in zip(acquisition.prisms, transfers, strict=True):
             field = to_field(sharp if transfer is None else sharp * transfer)
-            images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))
+            if prism is None or polarisation is None:
+                images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))
+            else:
+                stopped = to_field(sharp * prism.parallel(frequencies))
+                images.append(torch.einsum("syx,s->yx", polarisation.intensity(field, stopped, prism.bias), weights))
     shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
     return torch.stack(images).reshape(shape).transpose(0, 1)
 
 
-def _kept_by_imaging(acquisition: Acquisition) -> int:
-    return len(acquisition.focus) * (2 + 2 * len(acquisition.prisms))
+def _kept_by_imaging(microscope: Microscope, acquisition: Acquisition) -> int:
+    fields = 1 if microscope.polarisation is None or microscope.polarisation.ideal else 2
+    per_source = 0 if microscope.condenser_prism else 2 * fields * len(acquisition.prisms)
+    return len(acquisition.focus) * (2 + 2 * fields * len(acquisition.prisms)) + per_source
 
 
 def check_apertures(microscope: Microscope, background: float) -> None:
@@ -220,10 +270,11 @@ def check_apertures(microscope: Microscope, background: float) -> None:
 def _check_sampling(microscope: Microscope, grid: Grid) -> None:
     reach = microscope.reach
     coarsest = max((d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=0.0)
-    if reach > 0 and coarsest > microscope.wavelength / (2 * reach):
+    shortest = min(part.wavelength for part, _ in microscope.colours())
+    if reach > 0 and coarsest > shortest / (2 * reach):
         warnings.warn(
             f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "
-            f"{microscope.wavelength / (2 * reach):.3g} µm: the finest detail is lost",
+            f"{shortest / (2 * reach):.3g} µm: the finest detail is lost",
             SamplingWarning,
             stacklevel=3,
         )

@@ -1,11 +1,25 @@
-"""The Nomarski prism: two beams, displaced by the shear and out of phase by the bias."""
+"""The Nomarski prism: two beams, displaced by the shear and out of phase by the bias.
+
+Given directly, by the polariser of de Sénarmont's compensator, or by its wedge. Two cemented wedges of angle ψ of a
+birefringent crystal, their optic axes crossed, give the beams, polarised along one axis and the other, the path
+differences ±(n_e − n_o)·x·tanψ about the line x = 0 where the wedges are equally thick, and so, to first order in the
+birefringence, the split angle ε = 2(n_e − n_o)·tanψ. Light of frequency f crosses the back focal plane at
+x = λ·f_obj·f, so that with a prism centred at ξ beam 1 leads by 2π·(ε/λ)·(λ f_obj f − ξ) = 2π f·s + bias:
+    s = ε·f_obj,    bias = −2π s·ξ/(λ f_obj).
+
+G. Nomarski, J. Phys. Radium 16, 9S (1955); W. Lang, Zeiss Information 70, 114 (1968).
+"""
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+# Ordinary and extraordinary index at 546.1 nm: the dispersion equations of G. Ghosh, Opt. Commun. 163, 95 (1999).
+MATERIALS = {"quartz": (1.54614, 1.55531), "calcite": (1.66160, 1.48765)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +42,71 @@ class Prism:
             if not math.isfinite(number):
                 raise ValueError(f"{name} {number} must be a finite number")
 
-    def transfer(self, frequencies: Float[Tensor, "2 y x"]) -> Float[Tensor, "y x"]:
+    @classmethod
+    def senarmont(
+        cls, shear: tuple[float | Tensor, float | Tensor] | Float[Tensor, " 2"], polariser: float | Tensor
+    ) -> "Prism":
+        """A prism at its centre behind de Sénarmont's compensator: the bias is twice the polariser's angle.
+
+        polariser: rad by which the polariser is turned from 45° to the prism's axes, its crossed position, towards
+        beam 2's axis, in front of a quarter-wave plate whose slow axis is at 45°.
+        """
+        return cls(shear, 2 * polariser)
+
+    @classmethod
+    def from_wedge(
+        cls,
+        angle: float | Tensor,
+        focal_length: float | Tensor,
+        wavelength: float | Tensor,
+        *,
+        material: Literal["quartz", "calcite"] | None = None,
+        indices: tuple[float | Tensor, float | Tensor] | None = None,
+        offset: float | Tensor = 0.0,
+        direction: tuple[float, float] = (0.0, 1.0),
+    ) -> "Prism":
+        """The prism of two cemented wedges, see the module's docstring.
+
+        angle: ψ in rad of each wedge. focal_length: of the objective, f_tube/M, in µm. wavelength: in vacuum, µm.
+        material: its indices at 546 nm, or indices: (n_o, n_e), one of the two. offset: ξ in µm by which the prism is
+        displaced along `direction` (y, x), of any length, in which the wedge that is extraordinary for beam 1 grows
+        thicker. Numbers or 0-d tensors, which are learned. Raises ValueError for a wedge that isn't between −π/2 and
+        π/2, a focal length or wavelength that isn't positive, no direction, an unknown material, or not just one of
+        material and indices.
+        """
+        if (material is None) == (indices is None):
+            raise ValueError("a wedge needs either its material or its indices (n_o, n_e)")
+        if indices is None:
+            if material not in MATERIALS:
+                raise ValueError(f"material {material!r} must be one of {', '.join(map(repr, MATERIALS))}")
+            indices = MATERIALS[material]
+        for name, value in (("focal length", focal_length), ("wavelength", wavelength)):
+            if not (0 < float(torch.as_tensor(value).detach()) < math.inf):
+                raise ValueError(f"{name} {float(value)} µm must be above 0")
+        if not (abs(float(torch.as_tensor(angle).detach())) < math.pi / 2):
+            raise ValueError(f"wedge angle {float(angle)} rad must lie between −π/2 and π/2")
+        length = math.hypot(*direction)
+        if not (0 < length < math.inf):
+            raise ValueError(f"direction {direction} (y, x) must have a length above 0")
+        ordinary, extraordinary = indices
+        slope = angle.tan() if isinstance(angle, Tensor) else math.tan(angle)
+        shear = 2 * (extraordinary - ordinary) * slope * focal_length
+        bias = -2 * math.pi * shear * offset / (wavelength * focal_length)
+        return cls((shear * (direction[0] / length), shear * (direction[1] / length)), bias)
+
+    def transfer(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
         """sin(π f·s + bias/2): the two beams' interference behind a crossed analyser, but for a constant factor i.
 
         It is taken at the envelope's frequency f, not at the field's f + f_s: the condenser prism at work, which
-        cancels the tilt's phase.
+        cancels the tilt's phase. Without a condenser prism it is taken at f + f_s, for each source.
         """
+        return torch.sin(self._half_difference(frequencies))
+
+    def parallel(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
+        """cos(π f·s + bias/2): the two beams' interference behind a parallel analyser, what the crossed one stops."""
+        return torch.cos(self._half_difference(frequencies))
+
+    def _half_difference(self, frequencies: Tensor) -> Tensor:
         y, x = (torch.as_tensor(s, dtype=frequencies.dtype, device=frequencies.device) for s in self.shear)
         half_bias = torch.as_tensor(self.bias, dtype=frequencies.dtype, device=frequencies.device) / 2
-        return torch.sin(math.pi * (frequencies[0] * y + frequencies[1] * x) + half_bias)
+        return math.pi * (frequencies[..., 0, :, :] * y + frequencies[..., 1, :, :] * x) + half_bias

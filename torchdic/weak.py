@@ -68,7 +68,8 @@ def transfer_function(
 
     The image of a weak specimen is background + Σ_z F⁻¹[T·F{Δn(z)}]; T is per unit of Δn, or of κ with `absorption`.
     prism: None is bright field. focus: z_f in µm. Of fidelity only `sources` and `steps` count. Differentiable in the
-    prism, the focus, the background and the aberrations. Raises ValueError as `image` does.
+    prism, the focus, the background and the aberrations. Raises ValueError as `image` does, and for a prism where the
+    microscope has no condenser prism: its factor then differs from source to source.
     """
     acquisition = Acquisition((prism,), (focus,))
     return transfer_functions(
@@ -101,8 +102,8 @@ def transfer_functions(
         if prism is None:
             transfers.append(M + _reversed(M).conj())
         else:
-            D = prism.transfer(grid.frequencies(dtype=dtype, device=device))
-            transfers.append(D[0, 0].conj() * D * M + D[0, 0] * _reversed(D * M).conj())
+            D0D = _two_beams(prism, microscope, grid.frequencies(dtype=dtype, device=device))
+            transfers.append(D0D * M + _reversed(D0D * M).conj())
     return torch.stack(transfers)
 
 
@@ -111,7 +112,7 @@ def linear_image(
 ) -> Float[Tensor, "prism focus y x"]:
     """The image of a specimen to first order in Δn and κ; what `image` by the wave rung tends to for a weak one.
 
-    Relative to the empty bright field. Arguments and errors as of `image`.
+    Relative to the empty bright field. Arguments as of `image`, errors as of `transfer_function`.
     """
     grid, pad = volume.grid, fidelity.padding
     if pad:
@@ -126,10 +127,29 @@ def linear_image(
     frequencies = grid.frequencies(dtype=dtype, device=device)
     images = []
     for prism in acquisition.prisms:
-        D = torch.ones_like(frequencies[0]) if prism is None else prism.transfer(frequencies)
+        D0D = torch.ones_like(frequencies[0]) if prism is None else _two_beams(prism, microscope, frequencies)
         # the two cross terms are conjugate of each other in space
-        images.append(D[0, 0].abs().square() * through + 2 * to_field(D[0, 0].conj() * D * wave).real)
+        images.append(D0D[0, 0].real * through + 2 * to_field(D0D * wave).real)
     return torch.stack(images)[..., pad : grid.shape[1] - pad, pad : grid.shape[2] - pad]
+
+
+def _two_beams(prism: Prism, microscope: Microscope, frequencies: Float[Tensor, "2 y x"]) -> Tensor:
+    """The prism's factor conj(D(0))·D(f) of the linear transfer, (y, x); complex where the polarisation isn't ideal.
+
+    The polarisation's quadratic form a|S|² + b|C|² + Re(c·C·S*) is linear in the scattered light: S and C are the field
+    times real factors, so the factor is a·S(0)S(f) + b·C(0)C(f) + ½[c·S(0)C(f) + c*·C(0)S(f)].
+    """
+    if not microscope.condenser_prism:
+        raise ValueError(
+            "the linear transfer takes a prism's factor out of the sum over sources: it needs a condenser prism"
+        )
+    S, polarisation = prism.transfer(frequencies), microscope.polarisation
+    if polarisation is None or polarisation.ideal:
+        return S[0, 0] * S
+    C = prism.parallel(frequencies)
+    a, b, c = (v.to(S.device) for v in polarisation.form(prism.bias))
+    factor = a * S[0, 0] * S + b * C[0, 0] * C + (c * S[0, 0] * C + c.conj() * C[0, 0] * S) / 2
+    return factor.to(S.dtype.to_complex())
 
 
 def _kernel(
@@ -143,6 +163,13 @@ def _kernel(
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
     check_apertures(microscope, float(background.detach()))
+    if microscope.spectrum is not None:
+        colours = [
+            (share, *_kernel(grid, part, acquisition, background, fidelity, dtype, device))
+            for part, share in microscope.colours()
+        ]
+        kernels, shares_through = zip(*((share * M, share * passed) for share, M, passed in colours), strict=True)
+        return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
     depths, overlaps = _slabs(grid, fidelity, dtype, device)
     foci = torch.stack([torch.as_tensor(z, dtype=dtype, device=device) for z in acquisition.focus])

@@ -1,0 +1,184 @@
+"""Polarised light: Jones's 2×2 algebra, and the polarising optics of a DIC microscope.
+
+Fields vary as exp(+ikz), so a slow axis, whose path is optically longer, gains phase: a retarder of retardance Γ
+multiplies the component along its slow axis by exp(+iΓ/2) and the other by exp(−iΓ/2). Angles in rad are counted from
+axis 1 towards axis 2; the Nomarski prism's beam 1 is polarised along axis 1 and beam 2 along axis 2. Angles and
+retardances are numbers, which give float64, or tensors (any batch shape), which keep their dtype, device and graph.
+
+R. C. Jones, J. Opt. Soc. Am. 31, 488 (1941); E. Wolf, Nuovo Cimento 13, 1165 (1959) for the coherency matrix.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from functools import reduce
+
+import torch
+from jaxtyping import Complex, Float, Inexact
+from torch import Tensor
+
+
+def linear(angle: float | Tensor) -> Float[Tensor, "*batch 2"]:
+    """The Jones vector of unit light polarised linearly at an angle: (cos, sin), real."""
+    angle = _real(angle)
+    return torch.stack((angle.cos(), angle.sin()), -1)
+
+
+def rotation(angle: float | Tensor) -> Float[Tensor, "*batch 2 2"]:
+    """Turns the plane of polarisation by an angle, axis 1 towards axis 2; real."""
+    cos, sin = linear(angle).unbind(-1)
+    return torch.stack((cos, -sin, sin, cos), -1).unflatten(-1, (2, 2))
+
+
+def polariser(angle: float | Tensor) -> Float[Tensor, "*batch 2 2"]:
+    """An ideal polariser, or analyser, that passes light polarised at an angle: the projection on it, real."""
+    axis = linear(angle)
+    return axis[..., :, None] * axis[..., None, :]
+
+
+def retarder(retardance: float | Tensor, angle: float | Tensor) -> Complex[Tensor, "*batch 2 2"]:
+    """A lossless plate of retardance Γ in rad with its slow axis at an angle; complex and unitary.
+
+    R(angle)·diag(e^{iΓ/2}, e^{−iΓ/2})·R(−angle) = cos(Γ/2) + i·sin(Γ/2)·(2P − 1), P the projection on the slow axis.
+    """
+    retardance, angle = _alike(retardance, angle)
+    half, slow = retardance[..., None, None] / 2, polariser(angle)
+    unit = torch.eye(2, dtype=slow.dtype, device=slow.device)
+    return torch.complex(*torch.broadcast_tensors(half.cos() * unit, half.sin() * (2 * slow - unit)))
+
+
+def half_wave_plate(angle: float | Tensor) -> Complex[Tensor, "*batch 2 2"]:
+    """A retarder of π: mirrors the plane of polarisation at its slow axis."""
+    return retarder(math.pi, angle)
+
+
+def quarter_wave_plate(angle: float | Tensor) -> Complex[Tensor, "*batch 2 2"]:
+    """A retarder of π/2: makes light linear at 45° to its slow axis circular, and back."""
+    return retarder(math.pi / 2, angle)
+
+
+def train(*elements: Inexact[Tensor, "... 2 2"]) -> Inexact[Tensor, "... 2 2"]:
+    """The Jones matrix of elements in the order in which light meets them; raises ValueError for none."""
+    if not elements:
+        raise ValueError("a train of optics needs at least 1 element, not 0")
+    return reduce(lambda before, element: _matmul(element, before), elements)
+
+
+def apply(element: Inexact[Tensor, "... 2 2"], light: Inexact[Tensor, "... 2"]) -> Inexact[Tensor, "... 2"]:
+    """The Jones vector behind an element."""
+    return _matmul(element, light[..., None])[..., 0]
+
+
+def intensity(light: Inexact[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
+    """The intensity |E1|² + |E2|² of a Jones vector."""
+    return (light * light.conj()).real.sum(-1) if light.is_complex() else light.square().sum(-1)
+
+
+def leaky(angle: float | Tensor, extinction: float | Tensor | None) -> Float[Tensor, "*batch 2 2"]:
+    """A†A of a polariser that also passes the share `extinction` r of crossed intensity: P + r(1 − P), real.
+
+    It is the coherency matrix behind it of unpolarised light that has unit intensity along each axis, and the matrix W
+    of the intensity E†WE that it passes. Linear in r, where the Jones matrix has a √r of infinite slope at 0. None is
+    an ideal polariser.
+    """
+    if extinction is None:
+        return polariser(angle)
+    extinction, angle = _alike(extinction, angle)
+    passed = polariser(angle)
+    crossed = torch.eye(2, dtype=passed.dtype, device=passed.device) - passed
+    return passed + extinction[..., None, None] * crossed
+
+
+@dataclass(frozen=True, eq=False)
+class Polarisation:
+    """What is not ideal about the polarising optics of a DIC microscope; what is None is ideal, and costs nothing.
+
+    polariser_extinction, analyser_extinction: share of crossed intensity that each lets pass, 0 up to 1.
+    analyser_error: rad by which the analyser is turned from its crossed position. retardance_error: rad by which the
+    plate of de Sénarmont's compensator exceeds a quarter wave; to declare it, were it 0, is to say that each prism's
+    bias is set by the compensator, with the polariser turned by half the bias. Numbers or 0-d tensors; tensors are
+    learned. All act on DIC images alone: a bright field has no polarisers.
+    Raises ValueError where a value is not finite or an extinction lies outside [0, 1).
+
+    The polariser stands at 45° + t to the prism's axes, the plate's slow axis at 45°, the analyser at −45° + e. With
+    K = diag(e^{iϑ}, e^{−iϑ}) the two beams, ϑ = π f·s + bias/2, and J the light's coherency matrix in front of them,
+    I = tr(W K J K†). So I = sin²ϑ if all is ideal, and for an analyser off by e the amplitude is
+    i·sinϑ·cos e + cosϑ·sin e; a plate of retardance π/2 + δ makes the beams' intensities 1 ± sin(bias)·sin δ and
+    their interference cos(bias) + i·sin(bias)·cos δ, which an empty field doesn't show.
+    """
+
+    polariser_extinction: float | Tensor | None = None
+    analyser_extinction: float | Tensor | None = None
+    analyser_error: float | Tensor | None = None
+    retardance_error: float | Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            number = float(torch.as_tensor(value, dtype=torch.float64).detach())
+            if not math.isfinite(number):
+                raise ValueError(f"{field.name} {number} must be a finite number")
+            if field.name.endswith("extinction") and not (0 <= number < 1):
+                raise ValueError(f"{field.name} {number} must be at least 0 and below 1: a share of crossed light")
+
+    @property
+    def ideal(self) -> bool:
+        """Whether nothing is declared: the two beams are then a scalar pair."""
+        return all(getattr(self, field.name) is None for field in fields(self))
+
+    def form(self, bias: float | Tensor) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Complex[Tensor, ""]]:
+        """The intensity's quadratic form (a, b, c) in the fields S and C behind sinϑ and cosϑ, on the CPU.
+
+        I = a·|S|² + b·|C|² + Re(c·C·S*), from K = cosϑ + iZ·sinϑ with Z = diag(1, −1): a = tr(WZJZ), b = tr(WJ),
+        c = −2i·tr(WJZ). bias: the prism's, in rad. float64, so that at extinction nothing but rounding is left of b.
+        """
+        p, r, e, delta, total = (
+            None if v is None else torch.as_tensor(v, dtype=torch.float64, device="cpu")
+            for v in (
+                self.polariser_extinction,
+                self.analyser_extinction,
+                self.analyser_error,
+                self.retardance_error,
+                bias,
+            )
+        )
+        W = leaky(-math.pi / 4 if e is None else e - math.pi / 4, r).to(torch.complex128)
+        if delta is None or total is None:
+            J = leaky(math.pi / 4, p).to(torch.complex128)
+        else:
+            # ϑ holds the bias, as the ideal compensator gives it: the last element takes it back out
+            plate = train(retarder(delta + math.pi / 2, math.pi / 4), retarder(-total, 0.0))
+            J = train(plate.mH, leaky(total / 2 + math.pi / 4, p), plate)
+        Z = torch.tensor([1.0, -1.0], dtype=torch.float64)
+        WJ = W * J.mT  # elementwise: the trace of a product
+        return (WJ * (Z[:, None] * Z)).sum().real, WJ.sum().real, -2j * (WJ * Z[:, None]).sum()
+
+    def intensity(
+        self, crossed: Complex[Tensor, "source y x"], parallel: Complex[Tensor, "source y x"], bias: float | Tensor
+    ) -> Float[Tensor, "source y x"]:
+        """The intensity from the fields S and C behind sinϑ and cosϑ, see `form`."""
+        kinds = (crossed.real.dtype, crossed.real.dtype, crossed.dtype)
+        a, b, c = (v.to(crossed.device, kind) for v, kind in zip(self.form(bias), kinds, strict=True))
+        return a * _squared(crossed) + b * _squared(parallel) + (c * parallel * crossed.conj()).real
+
+
+def _squared(field: Tensor) -> Tensor:
+    return torch.view_as_real(field).square().sum(-1)
+
+
+def _real(value: float | Tensor) -> Tensor:
+    return value if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
+
+
+def _alike(one: float | Tensor, other: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Both as tensors of one dtype and device, those of a tensor where there is one."""
+    if isinstance(one, Tensor):
+        return one, torch.as_tensor(other, dtype=one.dtype, device=one.device)
+    other = _real(other)
+    return torch.as_tensor(one, dtype=other.dtype, device=other.device), other
+
+
+def _matmul(left: Tensor, right: Tensor) -> Tensor:
+    kind = torch.promote_types(left.dtype, right.dtype)
+    return left.to(kind) @ right.to(kind)
