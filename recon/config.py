@@ -23,7 +23,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.descend import Recipe
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Layer, Microscope, Objective, Polarisation, Prism
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Layer, Microscope, Objective, Polarisation, Prism, Spectrum
 from torchdic.microscope import check_apertures
 
 T = TypeVar("T")

@@ -45,6 +45,11 @@ def exact_images(
     nz, ny, nx = grid.shape
     top, left = round(MARGIN * ny), round(MARGIN * nx)  # alike on both sides: the centre stays the centre
     wide = replace(grid, shape=(nz, ny + 2 * top, nx + 2 * left))
+    if microscope.spectrum is not None:
+        colours = microscope.colours()
+        return torch.stack(
+            [share * exact_images(specimen, grid, p, acquisition, fidelity) for p, share in colours]
+        ).sum(0)
     points, weights = microscope.sources(fidelity, dtype=torch.float64, device=torch.device("cpu"))
     na = None
     if microscope.objective is not None:

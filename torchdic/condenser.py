@@ -1,11 +1,48 @@
-"""Köhler illumination: the condenser's aperture as weighted plane waves."""
+"""Köhler illumination: the condenser's aperture as weighted plane waves, and the light's wavelengths."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Light of several wavelengths, whose images add up.
+
+    wavelengths: in vacuum, µm. weights: their shares of what the camera records of the empty bright field (the lamp's
+    power times filters times quantum efficiency), made to sum to 1; None means equal ones. The directions n·sinθ of the
+    sources are the same for each. Phases given in rad, a prism's bias and Zernike aberrations, hold at each wavelength
+    (an achromatic compensator, so that an empty field stays sin²(bias/2)); lengths, a layer's thickness, scale with it.
+    Raises ValueError for no wavelengths, one that isn't positive, a negative weight or unequal numbers of the two.
+    """
+
+    wavelengths: Sequence[float]
+    weights: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.wavelengths) == 0:
+            raise ValueError("a spectrum needs at least one wavelength")
+        for wavelength in self.wavelengths:
+            if not (0 < wavelength < math.inf):
+                raise ValueError(f"wavelength {wavelength} µm of the spectrum must be above 0")
+        object.__setattr__(self, "wavelengths", tuple(self.wavelengths))
+        if self.weights is not None:
+            if len(self.weights) != len(self.wavelengths):
+                raise ValueError(f"spectrum has {len(self.wavelengths)} wavelengths and {len(self.weights)} weights")
+            if not (all(weight >= 0 for weight in self.weights) and 0 < sum(self.weights) < math.inf):
+                raise ValueError("spectrum weights must be at least 0, with a positive finite sum")
+            object.__setattr__(self, "weights", tuple(self.weights))
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """The weights, made to sum to 1."""
+        weights = (1.0,) * len(self.wavelengths) if self.weights is None else self.weights
+        return tuple(weight / sum(weights) for weight in weights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,12 +35,13 @@ class SamplingWarning(UserWarning):
 class Microscope:
     """What the microscope is.
 
-    wavelength: in vacuum, µm; of a spectrum the nominal one, in which nothing is computed. objective: None lets every propagating wave through. condenser: None is one axial plane
-    wave. camera: what it records of an image; the images of `image` are noiseless all the same. polarisation: None is
-    ideal crossed polarisers. condenser_prism: whether a second prism in front of the condenser makes up for each
-    source's tilt, as in Nomarski's microscope; without it the beams of an oblique source differ by 2π f_s·s more, and
-    a wide condenser washes the contrast out, by 2J1(a)/a with a = 2π|s|NA_c/λ.
-    Raises ValueError for a wavelength that isn't positive.
+    wavelength: in vacuum, µm. objective: None lets every propagating wave through. condenser: None is one axial plane
+    wave. camera: what it records of an image; the images of `image` are noiseless all the same. spectrum: light of
+    several wavelengths, among which `wavelength` is the nominal one; None is light of `wavelength` alone. polarisation:
+    None is ideal crossed polarisers. condenser_prism: whether a second prism in front of the condenser makes up for
+    each source's tilt, as in Nomarski's microscope; without it the beams of an oblique source differ by 2π f_s·s more,
+    and a wide condenser washes the contrast out, by 2J1(a)/a with a = 2π|s|NA_c/λ.
+    Raises ValueError for a wavelength that isn't positive or lies outside the spectrum.
     """
 
     wavelength: float
