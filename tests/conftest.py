@@ -89,3 +89,19 @@ def smooth_field():
         return (size / 3 * field).to(dtype)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def measured_file():
+    """A function from a name to the measured file; the test skips where it is absent."""
+
+    def find(name):
+        folder = os.environ.get("TORCHDIC_DATA")
+        if not folder:
+            pytest.skip("TORCHDIC_DATA is unset: no measured data")
+        path = Path(folder) / name
+        if not path.is_file():
+            pytest.skip(f"TORCHDIC_DATA holds no {name}")
+        return path
+
+    return find

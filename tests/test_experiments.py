@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-import os
 import sys
 from pathlib import Path
 
@@ -69,10 +68,8 @@ def test_a_missing_image_is_one_line_and_exit_2(measured, monkeypatch, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
-def test_the_measured_beads_are_round_and_alike(measured, monkeypatch, tmp_path):
-    folder = os.environ.get("TORCHDIC_DATA")
-    if folder is None or not (Path(folder) / "dic_agar_beads.tiff").exists():
-        pytest.skip("TORCHDIC_DATA does not name a folder with dic_agar_beads.tiff")
+def test_the_measured_beads_are_round_and_alike(measured, measured_file, monkeypatch, tmp_path):
+    measured_file("dic_agar_beads.tiff")
     assert run(measured, monkeypatch, "--out", tmp_path / "out") == 0
     phase = read_volume(tmp_path / "out" / "volume.ome.tif")[0][0].numpy()
     # the large bead, left of the middle and below: its disc against the ring around it

@@ -1,7 +1,5 @@
 import math
-import os
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,22 +10,6 @@ from recon.shear_axis import estimate_shear_axis
 from torchdic.tiff import Stack, StackError, StackWarning, read_stack, write_stack
 
 RIGHT = math.pi / 2
-
-
-@pytest.fixture
-def measured_file():
-    """A function from a name to the measured file; the test skips where it is absent."""
-
-    def find(name):
-        folder = os.environ.get("TORCHDIC_DATA")
-        if not folder:
-            pytest.skip("TORCHDIC_DATA is unset: no measured data")
-        path = Path(folder) / name
-        if not path.is_file():
-            pytest.skip(f"TORCHDIC_DATA holds no {name}")
-        return path
-
-    return find
 
 
 def blobs(shape, angle, seed, count=60):
