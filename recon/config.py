@@ -55,6 +55,27 @@ class VolumeSection:
 
 
 @dataclass(frozen=True)
+class CompensatorSection:
+    """A prism whose bias de Sénarmont's polariser sets, see `Prism.senarmont`: shear (y, x) in µm, polariser in rad."""
+
+    shear: tuple[float, float]
+    polariser: float
+
+
+@dataclass(frozen=True)
+class WedgeSection:
+    """A prism given by its wedge, see `Prism.from_wedge`, whose angle is `wedge`."""
+
+    wedge: float
+    focal_length: float
+    wavelength: float
+    material: Literal["quartz", "calcite"] | None = None
+    indices: tuple[float, float] | None = None
+    offset: float = 0.0
+    direction: tuple[float, float] = (0.0, 1.0)
+
+
+@dataclass(frozen=True)
 class DataSection:
     """The measured stack, and how it is brought to the model's unit; see `recon.measured.prepare`."""
 
@@ -221,6 +242,12 @@ def _prism(value: Any, _: Any) -> Prism | None:
         return None
     if not isinstance(value, dict):
         raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
+    if "polariser" in value:
+        compensator = converter.structure(value, CompensatorSection)
+        return Prism.senarmont(compensator.shear, compensator.polariser)
+    if "wedge" in value:
+        given = vars(converter.structure(value, WedgeSection))
+        return Prism.from_wedge(given["wedge"], **{key: v for key, v in given.items() if key != "wedge"})
     return converter.structure(value, Prism)
 
 

@@ -418,3 +418,47 @@ def test_unphysical_polarisation_in_toml_is_an_error_that_names_the_key(tmp_path
         path.write_text(CONFIG.format(more=more))
         with pytest.raises(ConfigError, match=message):
             load(path)
+
+
+def test_prisms_in_toml_may_be_given_by_polariser_or_wedge_and_are_dumped_resolved(tmp_path):
+    path = tmp_path / "config.toml"
+    prisms = """prisms = [
+    { shear = [0.1, 0.2], polariser = 0.35 },
+    { wedge = 0.01, focal_length = 1800, wavelength = 0.546, material = "quartz", offset = 25, direction = [3, 4] },
+    { wedge = 0.01, focal_length = 1800, wavelength = 0.546, indices = [1.5, 1.51] },
+    ]"""
+    start = CONFIG.format(more="")
+    start = start[: start.index("prisms =")]
+    path.write_text(start + prisms)
+    expected = [
+        Prism.senarmont((0.1, 0.2), 0.35),
+        Prism.from_wedge(0.01, 1800.0, 0.546, material="quartz", offset=25.0, direction=(3.0, 4.0)),
+        Prism.from_wedge(0.01, 1800.0, 0.546, indices=(1.5, 1.51)),
+    ]
+    for _ in range(2):
+        found = load(path).acquisition.prisms
+        assert [(p.shear, p.bias) for p in found] == [(p.shear, p.bias) for p in expected]
+        path.write_text(dump(load(path)))
+
+
+@pytest.mark.parametrize(
+    ("prism", "message"),
+    [
+        ("{ shear = [0.1, 0.2], polariser = 0.3, bias = 0.6 }", r"unknown key acquisition\.prisms\[0\]\.bias"),
+        (
+            "{ wedge = 0.01, focal_length = 1800, wavelength = 0.546 }",
+            r"prisms\[0\]: a wedge needs either its material",
+        ),
+        ("{ wedge = 0.01, wavelength = 0.546 }", r"missing key acquisition\.prisms\[0\]\.focal_length"),
+        (
+            '{ wedge = 0.01, focal_length = 1800, wavelength = 0.546, material = "glass" }',
+            r"prisms\[0\]\.material: 'glass' must be one of 'quartz', 'calcite'",
+        ),
+    ],
+)
+def test_errors_of_such_prisms_name_the_key(tmp_path, prism, message):
+    path = tmp_path / "config.toml"
+    start = CONFIG.format(more="")
+    path.write_text(start[: start.index("prisms =")] + f"prisms = [{prism}]")
+    with pytest.raises(ConfigError, match=message):
+        load(path)
