@@ -114,11 +114,15 @@ def _simulate(options: argparse.Namespace) -> None:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
             images = image(Volume(grid, delta, specimen.background), microscope, acquisition, fidelity).cpu()
+    pixel = grid.spacing[1:]
     if microscope.camera is not None:
+        pixel = microscope.camera.pixel_spacing(pixel)
         images = microscope.camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
     focus = [float(f) for f in acquisition.focus]
-    write_stack(options.out / "stack.ome.tif", images.float(), grid.spacing[1:], _equal_step(focus))
-    figures.save(figures.draw_stack(images, acquisition.prisms, focus, grid.spacing[1:]), options.out / "stack.png")
+    # counts keep their integer dtype, by which a reader knows them
+    data = images.float() if images.is_floating_point() else images
+    write_stack(options.out / "stack.ome.tif", data, pixel, _equal_step(focus))
+    figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), options.out / "stack.png")
     print(f"{options.out / 'stack.ome.tif'}: {_counts(images.shape)}")
 
 

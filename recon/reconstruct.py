@@ -51,6 +51,12 @@ def load_data(config: Config) -> Measured:
     """The configuration's measured stack in the model's unit. Raises ConfigError or StackError."""
     if config.data is None:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
+    camera = config.microscope.camera
+    if camera is not None and camera.pixel_size is not None:
+        raise ConfigError(
+            f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
+            "volume's voxels"
+        )
     section = config.data
     measured = prepare(
         read_stack(section.path),

@@ -54,13 +54,16 @@ def exact_images(
     na = None
     if microscope.objective is not None:
         na = min(1.05 * microscope.objective.na, specimen.background)
-    total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), ny, nx, dtype=torch.float64)
+    total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), *wide.shape[1:], dtype=torch.float64)
     for some, share in zip(points.split(16), weights.split(16), strict=True):
-        part = replace(microscope, condenser=Condenser(microscope_na(microscope), some, share))
+        part = replace(microscope, condenser=Condenser(microscope_na(microscope), some, share), camera=None)
         field = specimen.field(wide, microscope.wavelength, some, padding=1.0, na=na)
         images = image_field(field, wide, part, acquisition, background=specimen.background)
-        total += float(share.sum()) * images[..., top : top + ny, left : left + nx]
-    return total
+        total += float(share.sum()) * images
+    camera = microscope.camera
+    if camera is not None and camera.pixel_size is not None:
+        return camera.integrate(total, grid.spacing[1:], (ny, nx))
+    return total[..., top : top + ny, left : left + nx]
 
 
 def microscope_na(microscope: Microscope) -> float:

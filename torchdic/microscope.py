@@ -110,8 +110,8 @@ def image(
 ) -> Float[Tensor, "prism focus y x"]:
     """Images of a volume, relative to the empty bright field.
 
-    Pixels are the volume's (y, x) voxel centres. Raises ValueError where an aperture exceeds the medium's index; warns
-    with SamplingWarning where the voxels are coarser than the light.
+    Pixels are the volume's (y, x) voxel centres, or those of a camera that has a pixel size. Raises ValueError where an
+    aperture exceeds the medium's index; warns with SamplingWarning where the voxels are coarser than the light.
     """
     check_apertures(microscope, float(volume.background.detach()))
     _check_sampling(microscope, volume.grid)
@@ -142,7 +142,7 @@ def _image(
 
     kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition)
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
-    return _cropped(total, pad)
+    return _seen(total, volume.grid, pad, microscope.camera)
 
 
 def propagate(
@@ -196,7 +196,7 @@ def image_field(
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
     kept = _kept_by_imaging(microscope, acquisition)
     total = sum_over_sources(intensity, (momentum, weights, own), own[0].numel(), kept, fidelity.memory)
-    return _cropped(total, pad)
+    return _seen(total, grid, pad, microscope.camera)
 
 
 def form_image(
@@ -294,5 +294,9 @@ def _padded(volume: Volume, pad: int) -> Volume:
     return Volume(_wider(volume.grid, pad), fields[0], volume.background, fields[1])
 
 
-def _cropped(images: Tensor, pad: int) -> Tensor:
+def _seen(images: Tensor, grid: Grid, pad: int, camera: Camera | None) -> Tensor:
+    """The images without their padding, on the camera's pixels if it has any."""
+    if camera is not None and camera.pixel_size is not None:
+        _, ny, nx = grid.shape
+        return camera.integrate(images, grid.spacing[1:], (ny - 2 * pad, nx - 2 * pad))
     return images if pad == 0 else images[..., pad:-pad, pad:-pad]
