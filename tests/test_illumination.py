@@ -10,6 +10,7 @@ from recon.config import ConfigError, dump, load
 from recon.simulate import exact_images
 from torchdic import (
     Acquisition,
+    Camera,
     Condenser,
     Fidelity,
     Grid,
@@ -23,6 +24,8 @@ from torchdic import (
     image,
     image_field,
 )
+from torchdic.microscope import propagate
+from torchdic.wave import axial_difference, exp_i, to_field
 from torchdic.weak import linear_image
 
 N0 = 1.36
@@ -221,10 +224,11 @@ def transforms(monkeypatch):
         ({"objective": Objective(0.75, apodisation="aplanatic")}, 1),
         ({"objective": Objective(0.75, layer=Layer(20.0, 1.36, 1.515))}, 1),
         ({"condenser": Condenser(0.4, inner_na=0.2)}, 1),
+        ({"camera": Camera(500, bits=12, pixel_size=0.4)}, 1),
         ({"spectrum": Spectrum((0.546,))}, 1),
         ({"spectrum": Spectrum((0.5, 0.546, 0.6))}, 3),
     ],
-    ids=["plain", "apodised", "layer", "annulus", "one-colour", "three-colours"],
+    ids=["plain", "apodised", "layer", "annulus", "camera", "one-colour", "three-colours"],
 )
 def test_transforms_are_those_of_propagation_and_of_each_prism_and_focus(
     volume, acquisition, transforms, parts, factor
@@ -233,3 +237,24 @@ def test_transforms_are_those_of_propagation_and_of_each_prism_and_focus(
     scope = Microscope(0.546, **({"objective": Objective(0.75), "condenser": Condenser(0.4)} | parts))
     assert transforms(lambda: image(volume, scope, acquisition, Fidelity("wave", order=2))) == factor * (16 + 6)
     assert transforms(lambda: image(volume, scope, acquisition, Fidelity("projection"))) == factor * (1 + 6)
+
+
+def test_absent_effects_leave_the_image_bit_for_bit(volume, acquisition, propagation, dtype):
+    """Written out without any of them: aperture, aberrations, exact defocus, shear and bias."""
+    volume = Volume(volume.grid, volume.delta.to(dtype), N0)
+    scope, fidelity = Microscope(0.546, Objective(0.75, {4: 0.3, 7: -0.2}), Condenser(0.4)), Fidelity(propagation)
+    momentum, weights = scope.sources(fidelity, dtype=dtype, device=torch.device("cpu"))
+    plane = volume.grid.extent[0] / 2 if propagation == "wave" else volume.mean_plane()
+    spectrum = propagate(volume, 0.546, momentum, plane, fidelity)
+    frequencies = volume.grid.frequencies(dtype=dtype)
+    difference, pz = axial_difference(volume.grid, 0.546, volume.background, momentum)
+    waves = momentum[:, :, None, None] + 0.546 * frequencies
+    spectrum = spectrum * exp_i(scope.objective.phase(waves))
+    spectrum = torch.where((pz > 0) & scope.objective.aperture(waves), spectrum, 0)
+    found = image(volume, scope, acquisition, fidelity)
+    for f, focus in enumerate(acquisition.focus):
+        sharp = spectrum * exp_i(2 * math.pi / 0.546 * (torch.tensor(focus, dtype=dtype) - plane) * difference)
+        for p, prism in enumerate(acquisition.prisms):
+            field = to_field(sharp if prism is None else sharp * prism.transfer(frequencies))
+            expected = torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights)
+            assert torch.equal(found[p, f], expected)
