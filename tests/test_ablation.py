@@ -1,0 +1,109 @@
+"""What each part of the propagation is worth, on the exact smooth ball: left out, its error is as large as stated.
+
+The bounds are docs/validation.md's table, whose command is `python benchmarks/ablation.py`, within a factor 1.5.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchdic import Fidelity
+
+PATH = Path(__file__).parents[1] / "benchmarks" / "ablation.py"
+# error at the four focus planes −σ, 0, σ, 2σ
+STATED = {
+    "no p_z": (0.029, 0.007, 0.034, 0.051),
+    "no amplitude": (0.054, 0.012, 0.066, 0.081),
+    "textbook screen": (0.068, 0.015, 0.060, 0.101),
+}
+RAYS = Fidelity("rays", steps=24)
+
+
+@pytest.fixture(scope="module")
+def ablation():
+    specification = importlib.util.spec_from_file_location("ablation", PATH)
+    module = importlib.util.module_from_spec(specification)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "ablation", module)
+        specification.loader.exec_module(module)
+        yield module
+
+
+@pytest.fixture(scope="module")
+def errors(ablation):
+    """Errors at each focus plane by name, each computed once: 24 steps of the rays, slabs of 1 µm, no padding."""
+    scene, found = ablation.read(), {}
+
+    def of(name, slices=None, rays=RAYS, padding=0):
+        key = (name, slices, rays, padding)
+        if key not in found:
+            depth = slices or (18 if name in ("textbook screen", "split step") else 120)
+            found[key] = torch.tensor(ablation.ablation(name, scene, depth, rays, padding))
+        return found[key]
+
+    return of
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_part_left_out_costs_what_is_stated(errors, name):
+    ratio = errors(name) / torch.tensor(STATED[name])
+    assert float(ratio.min()) > 1 / 1.5, errors(name)
+    assert float(ratio.max()) < 1.5, errors(name)
+
+
+def test_rays_and_corrected_split_step_err_by_thousandths(errors):
+    """24 steps and linear interpolation leave rays 0.002; padding as the reference's would leave the wave 0.0012."""
+    assert float(errors("rays").max()) < 0.0025
+    assert float(errors("split step").max()) < 0.002
+
+
+def test_each_part_is_worth_a_factor_of_its_own(errors):
+    """The amplitude matters more than its p_z, and either at least fivefold, out of focus twentyfold."""
+    assert bool((errors("no amplitude") > 1.4 * errors("no p_z")).all())
+    gain = errors("no p_z") / errors("rays")
+    assert float(gain.min()) > 4
+    assert float(gain[[0, 2, 3]].min()) > 15
+    gain = errors("textbook screen") / errors("split step")
+    assert float(gain.min()) > 15
+    assert float(gain[[0, 2, 3]].min()) > 40
+
+
+def test_reference_plane_at_the_exit_errs_many_times_more(errors):
+    ratio = errors("at the exit") / errors("rays")
+    assert float(ratio.min()) > 15, ratio
+    assert 60 < float(ratio.max()) < 300, ratio
+
+
+def test_thinner_slabs_do_not_mend_the_textbook_screen(errors):
+    """Its error is the kernel's, not the step's: with slabs of 0.5 µm it is the same to 2 %."""
+    thick, thin = errors("textbook screen"), errors("textbook screen", slices=36)
+    torch.testing.assert_close(thin, thick, rtol=0.02, atol=0)
+
+
+def test_restored_module_has_its_factor_again(ablation, errors):
+    """The ablation divides p_z out by a patch, and only while it runs."""
+    errors("no p_z")
+    assert torch.equal(torch.tensor(ablation.ablation("rays", ablation.read(), 120, RAYS, 0)), errors("rays"))
+
+
+@pytest.mark.slow
+def test_table_in_full(errors):
+    """As `python benchmarks/ablation.py` computes it: one step per 0.15 µm, the reference's own padding."""
+    fine = Fidelity("rays", padding=64)
+    good = errors("rays", 120, fine, 64)
+    assert float(good.max()) < 0.002
+    for name in ("no p_z", "no amplitude"):
+        ratio = errors(name, 120, fine, 64) / torch.tensor(STATED[name])
+        assert float(ratio.min()) > 1 / 1.2, name
+        assert float(ratio.max()) < 1.2, name
+    ratio = errors("at the exit", 120, fine, 64) / good
+    assert float(ratio.min()) > 12, ratio
+    assert 100 < float(ratio.max()) < 200, ratio
+    assert float(errors("split step", 18, fine, 64).max()) < 0.0015
+    for slices in (18, 120):
+        ratio = errors("textbook screen", slices, fine, 64) / torch.tensor(STATED["textbook screen"])
+        assert float(ratio.min()) > 1 / 1.2
+        assert float(ratio.max()) < 1.2
