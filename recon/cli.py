@@ -11,8 +11,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
-# Before torch, so that its idle threads sleep. Spinning ones, the default, wait for each other by the time slice wherever
-# another program wants a core too: small arrays then took up to forty times as long.
+# Before torch, so that its idle threads sleep. Spinning ones, the default, wait for each other by the time slice
+# wherever another program wants a core too: small arrays then took up to forty times as long.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
