@@ -39,6 +39,7 @@ from torchdic import (
     Volume,
     image,
 )
+from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
 
 SPECIMENS: dict[str, type] = {
@@ -61,6 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.command(options)
     except (ConfigError, StackError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
+    except TurnedRaysError as error:
+        return _fail(f"{options.config}: {error}; the wave has no such limit", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:

@@ -57,6 +57,11 @@ def load_data(config: Config) -> Measured:
             f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
             "volume's voxels"
         )
+    sheared = any(prism is not None for prism in config.acquisition.prisms)
+    if sheared and not config.microscope.condenser_prism and config.reconstruction.start == "linear":
+        raise ConfigError(
+            "reconstruction.start: 'linear' needs a condenser prism, microscope.condenser_prism is false; use 'zero'"
+        )
     section = config.data
     measured = prepare(
         read_stack(section.path),

@@ -42,9 +42,9 @@ def exact_images(
     specimen: ExactSpecimen, grid: Grid, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
 ) -> Float[Tensor, "prism focus y x"]:
     """Images of a specimen from its exact field, float64: none of our propagations takes part."""
-    nz, ny, nx = grid.shape
+    _, ny, nx = grid.shape
     top, left = round(MARGIN * ny), round(MARGIN * nx)  # alike on both sides: the centre stays the centre
-    wide = replace(grid, shape=(nz, ny + 2 * top, nx + 2 * left))
+    wide = grid.widened(top, left)
     if microscope.spectrum is not None:
         colours = microscope.colours()
         return torch.stack(

@@ -571,6 +571,35 @@ def test_changed_data_do_not_go_on_with_anothers_run(workplace, other, interrupt
     assert "data's sha256 was" in err
 
 
+# scenes that can't be computed as asked
+
+
+def test_a_linear_start_without_a_condenser_prism_is_refused_in_one_line(other, tmp_path):
+    microscope = {"condenser_prism": False}
+    code, err = command("reconstruct", other({"microscope": microscope}), "--out", tmp_path / "out")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "condenser_prism" in err
+    assert not (tmp_path / "out").exists()
+    zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
+    with pytest.warns(reconstruct.PoorFitWarning):  # two steps, and a stack from a microscope that has the prism
+        assert command("reconstruct", zero, "--out", tmp_path / "out")[0] == 0
+
+
+def test_rays_that_turn_are_told_in_one_line(other, tmp_path):
+    changes = {
+        "microscope": {"condenser": {"na": 1.4}, "objective": {"na": 1.4}},
+        "volume": {"spacing": [0.5, 0.09, 0.09]},
+        "fidelity": {"propagation": "rays"},
+        "specimen": {"contrast": -0.2, "centre": [0.0, 0.0, 0.0]},
+    }
+    code, err = command("simulate", other(changes), "--out", tmp_path / "out")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "rays can't go on toward +z" in err
+    assert not list((tmp_path / "out").iterdir())
+
+
 # warnings
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -42,6 +42,11 @@ class Grid:
     def index(self, axis: int, coordinate: float) -> float:
         """The fractional voxel index of a coordinate in µm: the inverse of `centre`."""
         return coordinate / self.spacing[axis] + (self.shape[axis] - 1) / 2
+
+    def widened(self, rows: int, columns: int) -> "Grid":
+        """The same voxels with so many more on each side along y and x; the centre stays the centre."""
+        nz, ny, nx = self.shape
+        return replace(self, shape=(nz, ny + 2 * rows, nx + 2 * columns))
 
     def coordinates(
         self, axis: int, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None

@@ -187,7 +187,7 @@ def image_field(
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
     n0 = torch.as_tensor(background, dtype=real.dtype, device=real.device)
     pad = fidelity.padding
-    grid = _wider(grid, pad)
+    grid = grid.widened(pad, pad)
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
@@ -281,17 +281,12 @@ def _check_sampling(microscope: Microscope, grid: Grid) -> None:
         )
 
 
-def _wider(grid: Grid, pad: int) -> Grid:
-    nz, ny, nx = grid.shape
-    return replace(grid, shape=(nz, ny + 2 * pad, nx + 2 * pad))
-
-
 def _padded(volume: Volume, pad: int) -> Volume:
     if pad == 0:
         return volume
     fields = [None if f is None else F.pad(f, (pad,) * 4) for f in (volume.delta, volume.absorption)]
     assert fields[0] is not None
-    return Volume(_wider(volume.grid, pad), fields[0], volume.background, fields[1])
+    return Volume(volume.grid.widened(pad, pad), fields[0], volume.background, fields[1])
 
 
 def _seen(images: Tensor, grid: Grid, pad: int, camera: Camera | None) -> Tensor:

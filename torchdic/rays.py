@@ -26,6 +26,10 @@ from torchdic.sampling import SliceSampler, spline_coefficients, window
 from torchdic.volume import Volume
 
 
+class TurnedRaysError(ValueError):
+    """Rays that can't go on toward +z: one line with their number and the law."""
+
+
 @dataclass(frozen=True, eq=False)
 class Rays:
     """Rays that cross one plane of constant z.
@@ -62,7 +66,7 @@ def launch(
 
     Unperturbed, they would cross `plane` (µm) at the voxel centres, continued by `margin` rows and columns a side.
     """
-    wide = replace(grid, shape=(grid.shape[0], grid.shape[1] + 2 * margin, grid.shape[2] + 2 * margin))
+    wide = grid.widened(margin, margin)
     y, x = (wide.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
     landing = torch.stack(torch.meshgrid(y, x, indexing="ij"), -1)
     p0 = momentum[:, None, None, :]
@@ -75,7 +79,7 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     """Rays from the volume's first face, z = −nz·dz/2, to its last, z = +nz·dz/2.
 
     Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (its momentum at the start, in the
-    background). Raises ValueError where a ray can't go on toward +z: where the index falls to its transverse momentum.
+    background). Raises TurnedRaysError where a ray can't go on toward +z: the index falls to its transverse momentum.
     """
     change = deviation(volume, rays, fidelity)
     slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
@@ -149,7 +153,7 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
         state = recompute(cross, z0, z1, last - first, state, when=crowded)
     stopped = ~torch.isfinite(state[4])
     if bool(stopped.any()):
-        raise ValueError(
+        raise TurnedRaysError(
             f"{int(stopped.sum())} of {stopped.numel()} rays can't go on toward +z: "
             "inside the volume the index falls to their transverse momentum"
         )

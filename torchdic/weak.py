@@ -17,7 +17,6 @@ N. Streibl, J. Opt. Soc. Am. A 2, 121 (1985) for the bright field.
 """
 
 import math
-from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -114,10 +113,8 @@ def linear_image(
 
     Relative to the empty bright field. Arguments as of `image`, errors as of `transfer_function`.
     """
-    grid, pad = volume.grid, fidelity.padding
-    if pad:
-        nz, ny, nx = grid.shape
-        grid = replace(grid, shape=(nz, ny + 2 * pad, nx + 2 * pad))
+    pad = fidelity.padding
+    grid = volume.grid.widened(pad, pad)
     n0, dtype, device = volume.background, volume.delta.dtype, volume.delta.device
     M, through = _kernel(grid, microscope, acquisition, n0, fidelity, dtype, device)
     scattered = to_spectrum(F.pad(volume.delta, (pad,) * 4))
