@@ -583,7 +583,7 @@ def test_a_linear_start_without_a_condenser_prism_is_refused_in_one_line(other, 
     assert not (tmp_path / "out").exists()
     zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
     with pytest.warns(reconstruct.PoorFitWarning):  # two steps, and a stack from a microscope that has the prism
-        assert command("reconstruct", zero, "--out", tmp_path / "out")[0] == 0
+        reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
 
 
 def test_rays_that_turn_are_told_in_one_line(other, tmp_path):
