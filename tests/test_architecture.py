@@ -19,6 +19,7 @@ LAYERS = (
     "condenser",
     "fidelity",
     "recompute",
+    "caustics",
     "rays",
     "landing",
     "projection",

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from torchdic.caustics import tubes_that_may_fold
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import Deviation, axial_momentum, deviation, launch
@@ -41,7 +42,8 @@ def ray_field(
     """
     grid, n0 = volume.grid, volume.background
     p0 = momentum[:, None, None, :]
-    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity, turn=turned)
+    tubes = tubes_that_may_fold(volume, momentum, fidelity)
+    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity, turn=turned, watch=tubes)
     landed = extend(leaving, p0, n0, plane - grid.extent[0] / 2)
     tube = None
     if fidelity.amplitude:
@@ -51,9 +53,12 @@ def ray_field(
 
     with torch.no_grad():
         source, triangle, pixel = mesh.covered(landed.position)
-        ahead = plane > grid.extent[0] / 2
-        caustics = _caustic_phase(mesh.edges(leaving.position), mesh.edges(landed.position), forward=ahead)
-        caustic = caustics[source, triangle]
+        crossed = _crossed(mesh.edges(leaving.position), mesh.edges(landed.position))
+        # a caustic costs a quarter of a wave where it is passed forward, and the way back to the plane gives it back
+        quarters = -crossed if plane > grid.extent[0] / 2 else crossed
+        if tubes is not None:
+            quarters = quarters - mesh.of_triangles(tubes.passed())
+        caustic = (math.pi / 2) * quarters[source, triangle]
 
     def corners(values: Tensor) -> Tensor:
         return mesh.flat(values)[source[:, None], mesh.triangles[triangle]]
@@ -135,6 +140,16 @@ class _Mesh:
             values = values[:, self._rows.clamp(0, self._size[0] - 1)][:, :, self._columns.clamp(0, self._size[1] - 1)]
         return values.flatten(1, 2)
 
+    def of_triangles(self, values: Tensor) -> Tensor:
+        """Values of both triangles of each traced cell, and of those in a ring around, as (source, triangle).
+
+        values: (source, row, column, 2). All cells beyond the ring are as those in it.
+        """
+        rows, columns = (
+            i[:-1].clamp(-1, n - 1) + 1 for i, n in zip((self._rows, self._columns), self._size, strict=True)
+        )
+        return values[:, rows][:, :, columns].flatten(1)
+
     def edges(self, displacement: Tensor) -> Tensor:
         """Two edges of each triangle, (source, triangle, 2, 2) in µm, where rays are displaced so far."""
         corner = (self.home * self.spacing + self.flat(displacement))[:, self.triangles]
@@ -174,11 +189,10 @@ class _Mesh:
         return source[inside], triangle[inside], pixel[inside]
 
 
-def _caustic_phase(leaving: Tensor, landed: Tensor, *, forward: bool = False) -> Tensor:
-    """−π/2 for a caustic crossed on the way to the exit, +π/2 for each crossed on the way back to the reference plane.
+def _crossed(leaving: Tensor, landed: Tensor) -> Tensor:
+    """How many caustics lie between two planes with nothing but the background between them, (source, triangle).
 
-    forward: the plane lies behind the exit, and its caustics cost −π/2 too. Both meshes are given by two edges of
-    each triangle, (source, triangle, 2, 2).
+    Both meshes are given by two edges of each triangle, (source, triangle, 2, 2).
     """
     start, stop = _cross(*leaving.unbind(2)), _cross(*landed.unbind(2))
     # the area on the way is a parabola in the fraction s of the way: start + slope·s + bend·s²
@@ -189,8 +203,7 @@ def _caustic_phase(leaving: Tensor, landed: Tensor, *, forward: bool = False) ->
     lowest = start + slope * turning / 2
     # rays are normals of a wavefront, so the parabola's zeros are real; at a symmetric focus they are one
     twice = (start * stop > 0) & (turning > 0) & (turning < 1) & (lowest * start < 1e-4 * start.square())
-    crossed = (start * stop < 0).to(start) + 2 * twice.to(start)
-    return (math.pi / 2) * ((-crossed if forward else crossed) - (start < 0).to(start))
+    return (start * stop < 0).to(start) + 2 * twice.to(start)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -18,7 +18,9 @@ sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
     dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)),    without the singularity of s and p on the axis.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -106,10 +108,18 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     )
 
 
-def deviation(volume: Volume, rays: Rays, fidelity: Fidelity, *, turn: bool = False) -> Deviation:
+def deviation(
+    volume: Volume,
+    rays: Rays,
+    fidelity: Fidelity,
+    *,
+    turn: bool = False,
+    watch: Callable[[Tensor], None] | None = None,
+) -> Deviation:
     """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`.
 
-    turn: whether to find τ too.
+    turn: whether to find τ too. watch: is shown (δy, δx, δp_y, δp_x), shape (4, …) and without a graph, after each step
+    or, by an adaptive solver, at the slices' faces.
     """
     grid, n0 = volume.grid, volume.background
     fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
@@ -123,8 +133,11 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity, *, turn: bool = Fa
     pz0 = axial_momentum(n0, rays.momentum)
     vy, vx = py0 / pz0, px0 / pz0
 
-    def cross(z0: float, z1: float, steps: int, state: Tensor) -> Tensor:
-        near = window(grid, z0, z1, fidelity.interpolation)
+    def cross(first: int, last: int, state: Tensor) -> Tensor:
+        times = depths[first : last + 1]
+        # an adaptive solver looks beyond the end of its last step
+        seen = times if equal_steps else depths
+        near = window(grid, float(seen[0]), float(seen[-1]), fidelity.interpolation)
         samplers = [SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices]
 
         def slope(at: Tensor, state: Tensor) -> Tensor:
@@ -149,25 +162,29 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity, *, turn: bool = Fa
                 change.append((px * gradient_y - py * gradient_x) / (pz * (n + pz)))
             return torch.stack(change)
 
-        ends = torch.tensor((z0, z1), dtype=state.dtype, device=state.device)
+        ends = times[[0, -1]].to(state.device)
         try:
-            path = odeint(slope, state, ends, **_solver_options(fidelity, steps, grid.spacing[0]))
+            path = odeint(slope, state, ends, **_solver_options(fidelity, times, grid.spacing[0]))
         except AssertionError:
             # an adaptive solver gives up where a ray turns; equal steps leave nan there, to be counted below
-            path = odeint(
-                slope, state, ends, **_solver_options(replace(fidelity, solver="rk4"), steps, grid.spacing[0])
-            )
+            equal = _solver_options(replace(fidelity, solver="rk4"), times, grid.spacing[0])
+            path = odeint(slope, state, ends, **equal)
             if bool(torch.isfinite(torch.as_tensor(path[-1])).all()):
                 raise
         assert isinstance(path, Tensor)
         return path[-1]
 
     state = torch.zeros_like(y0 + py0).expand(4 + len(fields) + turn, *torch.broadcast_shapes(y0.shape, py0.shape))
-    steps = fidelity.steps or grid.shape[0]
+    equal_steps = fidelity.solver not in ADAPTIVE
+    steps = (fidelity.steps if equal_steps else None) or grid.shape[0]
+    # kept on the CPU: a depth read from another device would make every stage wait for it
+    depths = face + grid.extent[0] * torch.arange(steps + 1, dtype=state.dtype) / steps
+    depths[-1] = -face
     crowded = kept_by_rays(grid, fidelity) * state[0].numel() * state.element_size() > fidelity.memory
-    for first, last in slabs(steps, split=crowded and fidelity.solver not in ADAPTIVE):
-        z0, z1 = (face + grid.extent[0] * i / steps for i in (first, last))
-        state = recompute(cross, z0, z1, last - first, state, when=crowded)
+    for first, last in pairwise(range(steps + 1)) if watch else slabs(steps, split=crowded and equal_steps):
+        state = recompute(cross, first, last, state, when=crowded)
+        if watch:
+            watch(state[:4].detach())
     stopped = ~torch.isfinite(state[4])
     if bool(stopped.any()):
         raise TurnedRaysError(
@@ -185,7 +202,7 @@ def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:
     return per_step * (fidelity.steps or grid.shape[0])
 
 
-def _solver_options(fidelity: Fidelity, steps: int, slice_: float) -> dict:
+def _solver_options(fidelity: Fidelity, times: Tensor, slice_: float) -> dict:
     if fidelity.solver in ADAPTIVE:
         # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after
         # an empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume
@@ -196,10 +213,7 @@ def _solver_options(fidelity: Fidelity, steps: int, slice_: float) -> dict:
             "options": {"norm": _largest, "max_step": slice_},
         }
 
-    def equal_steps(_function: object, _state: object, ends: Tensor) -> Tensor:
-        return torch.cat((ends[:1] + (ends[1] - ends[0]) * torch.arange(steps).to(ends) / steps, ends[1:]))
-
-    return {"method": fidelity.solver, "options": {"grid_constructor": equal_steps}}
+    return {"method": fidelity.solver, "options": {"grid_constructor": lambda *_: times}}
 
 
 def _largest(state: Tensor) -> Tensor:
