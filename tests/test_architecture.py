@@ -19,6 +19,8 @@ LAYERS = (
     "condenser",
     "fidelity",
     "recompute",
+    "ray_equation",
+    "ray_solver",
     "caustics",
     "rays",
     "landing",

@@ -206,7 +206,7 @@ class _CurvedSampler(SliceSampler):
 
     def curvature(self, z: float, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """∂²/∂y², ∂²/∂y∂x and ∂²/∂x² (1/µm²) at depth z and positions (y, x) in µm."""
-        field = self._blend(z)
+        field = self.plane(z)
         (ny, nx), (dy, dx) = field.shape, self.grid.spacing[1:]
         iy, ix = self._indices(y, x)
         (rows, wy, sy), (columns, wx, sx) = _spline_taps(iy, ny), _spline_taps(ix, nx)

@@ -19,16 +19,17 @@ sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torchdiffeq import odeint
 
 from torchdic.fidelity import ADAPTIVE, Fidelity
 from torchdic.grid import Grid
+from torchdic.ray_equation import RayEquation
+from torchdic.ray_solver import solve
 from torchdic.recompute import recompute, slabs
 from torchdic.sampling import SliceSampler, spline_coefficients, window
 from torchdic.volume import Volume
@@ -127,54 +128,21 @@ def deviation(
         fields = [spline_coefficients(f) for f in fields]
     slices = [f.unbind(0) for f in fields]
     face = -grid.extent[0] / 2
-    # y and x apart: the loop below is spent on sums over pairs otherwise
-    y0, x0 = rays.position.unbind(-1)
-    py0, px0 = rays.momentum.unbind(-1)
-    pz0 = axial_momentum(n0, rays.momentum)
-    vy, vx = py0 / pz0, px0 / pz0
+    # y and x apart: the solution is spent on sums over pairs otherwise
+    position, momentum = (v.movedim(-1, 0) for v in torch.broadcast_tensors(rays.position, rays.momentum))
+    pz0 = axial_momentum(n0, rays.momentum).expand(momentum.shape[1:])
+    straight = torch.cat((position, momentum / pz0, momentum, pz0[None]))
 
     def cross(first: int, last: int, state: Tensor) -> Tensor:
         times = depths[first : last + 1]
         # an adaptive solver looks beyond the end of its last step
         seen = times if equal_steps else depths
         near = window(grid, float(seen[0]), float(seen[-1]), fidelity.interpolation)
-        samplers = [SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices]
+        index, *absorption = (SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices)
+        kappa = absorption[0] if absorption else None
+        return solve(RayEquation(straight, n0, index, kappa, face, turn), state, times, fidelity)
 
-        def slope(at: Tensor, state: Tensor) -> Tensor:
-            z, (dy, dx, dpy, dpx) = float(at), state[:4]
-            y, x = y0 + vy * (z - face) + dy, x0 + vx * (z - face) + dx
-            delta, gradient_y, gradient_x = samplers[0].sample(z, y, x)
-            n, py, px = n0 + delta, py0 + dpy, px0 + dpx
-            pz = (n * n - py * py - px * px).sqrt()
-            contrast = delta * (2 * n0 + delta)
-            q = (contrast - dpy * (py + py0) - dpx * (px + px0)) / (pz + pz0)
-            bend = n / pz
-            change = [
-                (dpy - vy * q) / pz,
-                (dpx - vx * q) / pz,
-                gradient_y * bend,
-                gradient_x * bend,
-                (contrast + dpy * dpy + dpx * dpx + q * q) / (2 * pz),
-            ]
-            if len(samplers) == 2:
-                change.append(samplers[1].value(z, y, x) * bend)
-            if turn:
-                change.append((px * gradient_y - py * gradient_x) / (pz * (n + pz)))
-            return torch.stack(change)
-
-        ends = times[[0, -1]].to(state.device)
-        try:
-            path = odeint(slope, state, ends, **_solver_options(fidelity, times, grid.spacing[0]))
-        except AssertionError:
-            # an adaptive solver gives up where a ray turns; equal steps leave nan there, to be counted below
-            equal = _solver_options(replace(fidelity, solver="rk4"), times, grid.spacing[0])
-            path = odeint(slope, state, ends, **equal)
-            if bool(torch.isfinite(torch.as_tensor(path[-1])).all()):
-                raise
-        assert isinstance(path, Tensor)
-        return path[-1]
-
-    state = torch.zeros_like(y0 + py0).expand(4 + len(fields) + turn, *torch.broadcast_shapes(y0.shape, py0.shape))
+    state = straight.new_zeros(4 + len(fields) + turn, *straight.shape[1:])
     equal_steps = fidelity.solver not in ADAPTIVE
     steps = (fidelity.steps if equal_steps else None) or grid.shape[0]
     # kept on the CPU: a depth read from another device would make every stage wait for it
@@ -198,23 +166,4 @@ def deviation(
 
 def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:
     """Values per ray that autograd keeps for the backward pass."""
-    per_step = {"linear": 110, "cubic": 460}[fidelity.interpolation]
-    return per_step * (fidelity.steps or grid.shape[0])
-
-
-def _solver_options(fidelity: Fidelity, times: Tensor, slice_: float) -> dict:
-    if fidelity.solver in ADAPTIVE:
-        # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after
-        # an empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume
-        return {
-            "method": fidelity.solver,
-            "rtol": fidelity.tolerance,
-            "atol": fidelity.tolerance,
-            "options": {"norm": _largest, "max_step": slice_},
-        }
-
-    return {"method": fidelity.solver, "options": {"grid_constructor": lambda *_: times}}
-
-
-def _largest(state: Tensor) -> Tensor:
-    return state.abs().max()
+    return 27 * (fidelity.steps or grid.shape[0])

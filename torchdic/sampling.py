@@ -41,7 +41,26 @@ class SliceSampler:
         self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
     ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
         """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
-        field, (dy, dx) = self._blend(z), self.grid.spacing[1:]
+        return self.sample_plane(self.plane(z), y, x)
+
+    def value(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, " *ray"]:
+        """The field alone at depth z and positions (y, x) in µm."""
+        return self.value_plane(self.plane(z), y, x)
+
+    def plane(self, z: float) -> Float[Tensor, "y x"]:
+        """The slice blended for depth z; of spline coefficients for "cubic"."""
+        weights = depth_weights(self.grid, z, self.interpolation)
+        (first, weight), *others = weights.items()
+        field = self.slices[first - self.first] * weight
+        for i, weight in others:
+            field = field.add(self.slices[i - self.first], alpha=weight)
+        return field
+
+    def sample_plane(
+        self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
+    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
+        """As `sample`, of a slice that `plane` blended."""
+        dy, dx = self.grid.spacing[1:]
         if self.interpolation == "cubic":
             value, slope_y, slope_x = _sample_cubic(field, *self._indices(y, x))
             slope_y, slope_x = slope_y / dy, slope_x / dx
@@ -53,9 +72,10 @@ class SliceSampler:
             value, slope_y, slope_x = self._linear(torch.stack((padded[1:-1, 1:-1], slopes_y, slopes_x)), y, x)
         return value, slope_y, slope_x
 
-    def value(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, " *ray"]:
-        """The field alone at depth z and positions (y, x) in µm."""
-        field = self._blend(z)
+    def value_plane(
+        self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
+    ) -> Float[Tensor, " *ray"]:
+        """As `value`, of a slice that `plane` blended."""
         if self.interpolation == "cubic":
             return _sample_cubic(field, *self._indices(y, x))[0]
         return self._linear(field[None], y, x)[0]
@@ -74,14 +94,6 @@ class SliceSampler:
     def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
         return y / dy + (ny - 1) / 2, x / dx + (nx - 1) / 2
-
-    def _blend(self, z: float) -> Float[Tensor, "y x"]:
-        weights = depth_weights(self.grid, z, self.interpolation)
-        (first, weight), *others = weights.items()
-        field = self.slices[first - self.first] * weight
-        for i, weight in others:
-            field = field.add(self.slices[i - self.first], alpha=weight)
-        return field
 
 
 def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:
