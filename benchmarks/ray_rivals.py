@@ -7,6 +7,8 @@ first face in one direction.
 """
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,7 +17,7 @@ VOXEL = 0.1  # µm
 DIRECTION = (0.2, -0.1)  # n·sinθ, (y, x)
 
 
-def start(shape: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+def start(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Position and momentum (2, ray) of each ray on the first face."""
     y, x = ((np.arange(n) - (n - 1) / 2) * VOXEL for n in shape[1:])
     position = np.stack(np.meshgrid(y, x, indexing="ij")).reshape(2, -1).astype(np.float32)
@@ -28,14 +30,15 @@ class Torchdic:
 
     budget = 1 << 34
 
-    def __init__(self, delta: np.ndarray, steps: int, device: str) -> None:
+    def __init__(self, delta: np.ndarray, steps: int) -> None:
         import torch
 
         from torchdic import Fidelity, Grid, Rays, Volume
 
-        position, momentum = (torch.from_numpy(v).T.contiguous().to(device) for v in start(delta.shape))
-        self.delta = torch.nn.Parameter(torch.from_numpy(delta).to(device))
-        self.volume = Volume(Grid(delta.shape, (VOXEL,) * 3), self.delta, BACKGROUND)
+        position, momentum = (torch.from_numpy(v).T.contiguous() for v in start(delta.shape))
+        self.delta = torch.nn.Parameter(torch.from_numpy(delta))
+        nz, ny, nx = delta.shape
+        self.volume = Volume(Grid((nz, ny, nx), (VOXEL, VOXEL, VOXEL)), self.delta, BACKGROUND)
         self.rays = Rays(position, momentum, position.new_zeros(len(position)))
         self.fidelity = Fidelity("rays", steps=steps, memory=self.budget)
 
@@ -47,6 +50,7 @@ class Torchdic:
         return change.position.T, change.opd
 
     def forward(self) -> tuple[np.ndarray, np.ndarray]:
+        """Deviation (2, ray) and OPD (ray)."""
         import torch
 
         with torch.no_grad():
@@ -54,6 +58,7 @@ class Torchdic:
         return moved.cpu().numpy(), opd.cpu().numpy()
 
     def gradient(self) -> np.ndarray:
+        """∂/∂Δn of Σ OPD²."""
         self.delta.grad = None
         self.run()[1].square().sum().backward()
         assert self.delta.grad is not None
@@ -66,23 +71,28 @@ class TorchdicRecomputing(Torchdic):
     budget = 1
 
 
-class _Torchdiffeq:
+class _Torchdiffeq(ABC):
     """A straightforward use of torchdiffeq: state (y, x, p_y, p_x, W) and an index tensor that requires grad."""
 
-    def __init__(self, delta: np.ndarray, steps: int, device: str) -> None:
+    def __init__(self, delta: np.ndarray, steps: int) -> None:
         import torch
 
-        self.delta = torch.nn.Parameter(torch.from_numpy(delta).to(device))
-        position, momentum = (torch.from_numpy(v).to(device) for v in start(delta.shape))
+        self.delta = torch.nn.Parameter(torch.from_numpy(delta))
+        position, momentum = (torch.from_numpy(v) for v in start(delta.shape))
         self.position, self.momentum = position, momentum
         self.state = torch.cat((position, momentum, torch.zeros_like(position[:1])))
         nz, ny, nx = delta.shape
         self.half = nz * VOXEL / 2
-        self.z = torch.linspace(-self.half, self.half, steps + 1, device=device)
+        self.z = torch.linspace(-self.half, self.half, steps + 1)
         self.scale = [2 / (VOXEL * (n - 1)) for n in (nx, ny, nz)]
         self.pz0 = math.sqrt(BACKGROUND**2 - sum(p * p for p in DIRECTION))
 
+    @abstractmethod
+    def sampler(self) -> Callable:
+        """(z, y, x) → Δn, ∂Δn/∂y, ∂Δn/∂x."""
+
     def run(self):
+        """Deviation and OPD as tensors."""
         from torchdiffeq import odeint
 
         sample = self.sampler()
@@ -100,7 +110,9 @@ class _Torchdiffeq:
             opd = (contrast + dy * dy + dx * dx + q * q) / (2 * pz)
             return torch.stack((py / pz, px / pz, n * gy / pz, n * gx / pz, opd))
 
-        end = odeint(slope, self.state, self.z[[0, -1]], method="rk4", options={"step_size": float(self.z[1] - self.z[0])})[-1]
+        end = odeint(
+            slope, self.state, self.z[[0, -1]], method="rk4", options={"step_size": float(self.z[1] - self.z[0])}
+        )[-1]
         straight = self.position + self.momentum / self.pz0 * (2 * self.half)
         return end[:2] - straight, end[4]
 
@@ -109,18 +121,20 @@ class _Torchdiffeq:
 
 
 class Torchdiffeq3d(_Torchdiffeq):
-    """torchdiffeq with one 3-D grid_sample of (Δn, ∂Δn/∂y, ∂Δn/∂x) per evaluation."""
+    """torchdiffeq with one 3-D grid_sample of (Δn, ∇Δn) per evaluation."""
 
-    def sampler(self):
+    def sampler(self) -> Callable:
+        """(z, y, x) → Δn, ∂Δn/∂y, ∂Δn/∂x."""
         import torch
         import torch.nn.functional as F
 
-        padded = F.pad(self.delta[None, None], (1, 1, 1, 1, 0, 0), mode="replicate")[0, 0]
         gz, gy, gx = torch.gradient(self.delta, spacing=VOXEL)
         channels = torch.stack((self.delta, gz, gy, gx))[None]
 
         def sample(z, y, x):
-            where = torch.stack((x * self.scale[0], y * self.scale[1], torch.broadcast_to(z * self.scale[2], x.shape)), -1)
+            where = torch.stack(
+                (x * self.scale[0], y * self.scale[1], torch.broadcast_to(z * self.scale[2], x.shape)), -1
+            )
             values = F.grid_sample(channels, where[None, None, None], padding_mode="border", align_corners=True)
             return values[0, [0, 2, 3], 0, 0]
 
@@ -130,7 +144,8 @@ class Torchdiffeq3d(_Torchdiffeq):
 class Torchdiffeq2d(_Torchdiffeq):
     """torchdiffeq with a 2-D grid_sample in the slice blended for the current depth."""
 
-    def sampler(self):
+    def sampler(self) -> Callable:
+        """(z, y, x) → Δn, ∂Δn/∂y, ∂Δn/∂x."""
         import torch
         import torch.nn.functional as F
 
@@ -153,16 +168,15 @@ class Torchdiffeq2d(_Torchdiffeq):
 class Diffrax:
     """diffrax on JAX, jitted, slice by slice: an ODE solve through each slab, recursively checkpointed."""
 
-    def __init__(self, delta: np.ndarray, steps: int, device: str) -> None:
+    def __init__(self, delta: np.ndarray, steps: int) -> None:
         import diffrax
         import jax
         import jax.numpy as jnp
 
-        del device  # where JAX was installed for
         self.delta = jnp.asarray(delta)
         position, momentum = (jnp.asarray(v) for v in start(delta.shape))
         nz, ny, nx = delta.shape
-        half, dz = nz * VOXEL / 2, nz * VOXEL / steps
+        half = nz * VOXEL / 2
         pz0 = math.sqrt(BACKGROUND**2 - sum(p * p for p in DIRECTION))
         straight = position + momentum / pz0 * (2 * half)
 
@@ -213,6 +227,7 @@ class Diffrax:
                 stepsize_controller=diffrax.StepTo(ts=jnp.linspace(-half, half, steps + 1)),
                 adjoint=diffrax.RecursiveCheckpointAdjoint(),
             )  # fmt: skip
+            assert solution.ys is not None
             end = solution.ys[-1]
             return end[:2] - straight, end[4]
 
@@ -220,20 +235,21 @@ class Diffrax:
         self._gradient = jax.jit(jax.grad(lambda delta: (run(delta)[1] ** 2).sum()))
 
     def forward(self) -> tuple[np.ndarray, np.ndarray]:
+        """Deviation (2, ray) and OPD (ray)."""
         moved, opd = self._forward(self.delta)
         return np.asarray(moved), np.asarray(opd)
 
     def gradient(self) -> np.ndarray:
+        """∂/∂Δn of Σ OPD²."""
         return np.asarray(self._gradient(self.delta))
 
 
 class Numba:
     """A fused loop over rays, compiled by numba for all cores: about the least that a forward pass takes on a CPU."""
 
-    def __init__(self, delta: np.ndarray, steps: int, device: str) -> None:
+    def __init__(self, delta: np.ndarray, steps: int) -> None:
         import numba
 
-        del device
         self.delta, self.steps = delta, steps
         self.position, self.momentum = start(delta.shape)
         nz, ny, nx = delta.shape
@@ -299,6 +315,7 @@ class Numba:
         self._channels, self._step, self._pz0 = channels, step, pz0
 
     def forward(self) -> tuple[np.ndarray, np.ndarray]:
+        """Deviation (2, ray) and OPD (ray)."""
         state = np.concatenate((self.position, self.momentum, np.zeros_like(self.position[:1])))
         half = len(self.delta) * VOXEL / 2
         h = 2 * half / self.steps

@@ -1,17 +1,18 @@
 """Rays through a volume, with the gradient to every voxel: torchdic against other ways to do the same.
 
-    python benchmarks/rays.py [--repeats 3] [--voxels 64 256 256] [--steps 64] [--device cpu]
+    python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 3] [--ways Torchdic Diffrax ...]
 
-Each way runs in a process of its own, several times in turn with the others; seconds are medians after one warm-up run,
-memory is the peak above what the imports take (on a GPU, of the allocator). All integrate the ray ODE of torchdic.rays
-by the same RK4 steps in float32, through the same random smooth volume, from the same rays, and must agree on where the
-rays land before their times count. A package that isn't installed (`pip install torchdic[bench]`) is reported as missing.
+Each way of ray_rivals.py runs in a process of its own, in turn with the others; times are medians over the processes,
+each the best of three runs after a first one that compiles and warms up. Memory is the peak of resident memory above
+what the imports take. All solve the same ODE by as many Runge-Kutta steps of fourth order, through the same smooth
+random volume, from the same rays, in float32, and the table shows that they land alike (mean OPD in µm, and the
+gradient's absolute sum). A package that isn't installed (`pip install torchdic[bench]`) is reported as missing.
 """
 
 import argparse
+import importlib
 import importlib.util
 import json
-import math
 import resource
 import statistics
 import subprocess
@@ -20,44 +21,95 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+import ray_rivals
+from scipy.ndimage import gaussian_filter
 
-BACKGROUND = 1.36
-VOXEL = 0.1  # µm
-DIRECTION = (0.2, -0.1)  # n·sinθ, (y, x)
+# Each way and what it imports.
+WAYS = {
+    "Torchdic": ["torch", "torchdiffeq", "torchdic"],
+    "TorchdicRecomputing": ["torch", "torchdiffeq", "torchdic"],
+    "Torchdiffeq2d": ["torch", "torchdiffeq"],
+    "Torchdiffeq3d": ["torch", "torchdiffeq"],
+    "Diffrax": ["jax", "diffrax"],
+    "Numba": ["numba"],
+}
 
 
 def main() -> None:
     """Run every way in turn and print the table."""
-    arguments = _arguments()
-    if arguments.way:
-        print(json.dumps(_measure(arguments)))
+    parser = argparse.ArgumentParser(description="Rays through a volume: torchdic against other ways.")
+    parser.add_argument("--voxels", type=int, nargs=3, default=(64, 256, 256))
+    parser.add_argument("--steps", type=int, default=64)
+    parser.add_argument("--repeats", type=int, default=3, help="processes of each way")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    parser.add_argument("--alone", choices=list(WAYS), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    shape, steps = tuple(arguments.voxels), arguments.steps
+    if arguments.alone:
+        print(json.dumps(measure(arguments.alone, shape, steps)))
         return
-    results: dict[str, list[dict]] = {}
+    found: dict[str, list[dict[str, float]]] = {way: [] for way in arguments.ways}
+    missing = {way: [m for m in WAYS[way] if importlib.util.find_spec(m) is None] for way in arguments.ways}
     for _ in range(arguments.repeats):
-        for name, way in WAYS.items():
-            missing = [m for m in way.needs if importlib.util.find_spec(m) is None]
-            if missing:
-                results[name] = [{"missing": ", ".join(missing)}]
-                continue
-            command = [sys.executable, __file__, "--way", name, *sys.argv[1:]]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            results.setdefault(name, []).append(json.loads(done.stdout.splitlines()[-1]))
-    _print(results, arguments)
+        for way in arguments.ways:
+            if not missing[way]:
+                command = [sys.executable, __file__, *sys.argv[1:], "--alone", way]
+                done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+                found[way].append(json.loads(done.stdout.splitlines()[-1]))
+    print(f"{'×'.join(map(str, shape))} voxels, {shape[1] * shape[2]} rays, {steps} steps, float32\n")
+    print("| way | forward | peak | forward and gradient | peak | mean OPD | gradient |")
+    print("|---|---|---|---|---|---|---|")
+    for way in arguments.ways:
+        if missing[way]:
+            print(f"| {way} | not installed: {', '.join(missing[way])} | | | | | |")
+        else:
+            print(row(way, {key: statistics.median(r[key] for r in found[way]) for key in found[way][0]}))
 
 
-def _print(results: dict[str, list[dict]], arguments: argparse.Namespace) -> None:
-    nz, ny, nx = arguments.voxels
-    print(f"{nz}×{ny}×{nx} voxels, {ny * nx} rays, {arguments.steps} RK4 steps, float32, {arguments.device}\n")
-    print("| way | forward s | forward and gradient s | forward: peak MiB | with gradient: peak MiB | landing |")
-    print("|---|---|---|---|---|---|")
-    for name, runs in results.items():
-        if "missing" in runs[0]:
-            print(f"| {name} | not installed: {runs[0]['missing']} | | | | |")
-            continue
-        middle = {
-            key: statistics.median(r[key] for r in runs) if runs[0][key] is not None else math.nan for key in runs[0]
-        }
-        print(
-            f"| {name} | {middle['forward']:.2f} | {middle['gradient']:.2f} | {middle['forward_bytes'] / 2**20:.0f} "
-            f"| {middle['gradient_bytes'] / 2**20:.0f} | {middle['landing']:.6f} |"
-        )
+def row(way: str, middle: dict[str, float]) -> str:
+    """A line of the table; a way without a gradient has none."""
+    cells = [f"{middle['forward']:.2f} s", f"{middle['forward peak']:.0f} MiB"]
+    if "gradient" in middle:
+        cells += [f"{middle['gradient']:.2f} s", f"{middle['gradient peak']:.0f} MiB"]
+    else:
+        cells += ["", ""]
+    cells += [f"{middle['mean OPD']:.6f}", f"{middle['gradient sum']:.4g}" if "gradient" in middle else ""]
+    return f"| {way} | {' | '.join(cells)} |"
+
+
+def measure(way: str, shape: tuple[int, ...], steps: int) -> dict[str, float]:
+    """Seconds and peak MiB of one way, in this process."""
+    for module in WAYS[way]:
+        importlib.import_module(module)
+    noise = gaussian_filter(np.random.default_rng(0).standard_normal(shape), 4)
+    delta = (0.02 * noise / noise.std()).astype(np.float32)
+    imported = peak()
+    trial = getattr(ray_rivals, way)(delta, steps)
+    found = {}
+    found["forward"], (_, opd) = best(trial.forward)
+    found["forward peak"] = peak() - imported
+    found["mean OPD"] = float(opd.mean())
+    if hasattr(trial, "gradient"):
+        found["gradient"], gradient = best(trial.gradient)
+        found["gradient peak"] = peak() - imported
+        found["gradient sum"] = float(np.abs(gradient).sum())
+    return found
+
+
+def best(run: Callable) -> tuple[float, tuple | np.ndarray]:
+    """Seconds of the best of three runs after a first one, and what they gave."""
+    result, seconds = run(), []
+    for _ in range(3):
+        start = time.perf_counter()
+        result = run()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds), result
+
+
+def peak() -> float:
+    """The most memory that this process has held, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()

@@ -9,6 +9,7 @@ from torchdiffeq import odeint
 from torchdic import Fidelity, Grid
 from torchdic.ray_equation import RayEquation
 from torchdic.ray_solver import TABLEAUX, solve
+from torchdic.recompute import recompute
 from torchdic.sampling import SliceSampler, spline_coefficients
 
 GRID = Grid((5, 7, 6), (0.5, 0.3, 0.4))
@@ -123,3 +124,16 @@ def test_volume_changed_between_the_passes_is_an_error_not_a_wrong_gradient():
         field.add_(1)
     with pytest.raises(RuntimeError, match="modified inplace"):
         end.sum().backward()
+
+
+def test_recomputed_gradient_is_the_kept_one():
+    equation, learned = problem(absorbing=True, turn=True)
+    depths = torch.linspace(-1.25, 1.25, 5, dtype=torch.float64)
+    kept, again = (
+        torch.autograd.grad(
+            recompute(solve, equation, equation.start(), depths, Fidelity("rays"), when=when).sum(), learned
+        )
+        for when in (False, True)
+    )
+    for one, other in zip(kept, again, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)

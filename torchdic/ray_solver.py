@@ -46,8 +46,8 @@ def solve(
         return _Evaluation.apply(equation, float(z), state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
     # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after an
-    # empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume. A first step of
-    # its own choice would depend on the state, and gradients would run through the depths
+    # empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume. Its own choice
+    # of a first step depends on the state, and gradients would run through the depths
     slice_ = equation.index.grid.spacing[0]
     options = {"norm": _largest, "first_step": slice_, "max_step": slice_}
     tolerance, method = fidelity.tolerance, fidelity.solver
@@ -89,7 +89,8 @@ class _EqualSteps(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, state_bar: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         equation, visited, depths, solver = ctx.settings
-        tensors, states = ctx.saved_tensors[: -len(visited)], ctx.saved_tensors[-len(visited) :]
+        saved = ctx.saved_tensors
+        tensors, states = saved[: -len(visited)], saved[-len(visited) :]
         equation = _of(equation, tensors)
         sums = _Sums(equation)
         a, b = TABLEAUX[solver]
