@@ -27,6 +27,7 @@ LAYERS = (
     "jones",
     "prism",
     "objective",
+    "space_variant",
     "camera",
     "microscope",
     "weak",
