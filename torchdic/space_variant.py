@@ -7,8 +7,8 @@ which is no convolution. The last factor is interpolated between K levels δ_k t
 the Chebyshev nodes with their Lagrange polynomials w_k(δ), smooth in δ as hat functions are not. Of a phase
 that spans ±b rad the coefficients are Bessel functions, 2|J_j(b)| ≤ 2(b/2)^j/j!, so from K ≥ b on the error is below
     4·Σ_{j ≥ K} |J_j(b)| ≤ 8·(b/2)^K/K!,    b = k0·max|q|·(δ_max − δ_min)/2.
-K is the least for which that is a rounding: 8 levels for b = 1 in float32, where equal steps of 0.25 rad take 9
-and leave 1 %.
+K is the least for which that is a rounding: 9 levels for b = 1 in float32, as many as hat functions in steps of
+0.25 rad take, which leave 1 %.
 
 δ is the object's aberration for an axial ray, the same for all sources. It stands in for the amplitude that straight
 rays lack; a field that has it, of rays with their amplitude or of waves, would count it twice.
@@ -73,8 +73,8 @@ def object_levels(
     """Levels of the volume's own aberration at depth `plane` (µm), by the method that the fidelity names.
 
     The map's rays are those of `CAREFUL`, a cubic spline crossed by rk4, in the fidelity's steps. A cone's half angle
-    is asin(NA_c/n0). Raises ValueError for a cone without a condenser's aperture, and as `effective_defocus` and
-    `levels` do.
+    is asin(NA_c/n0), a choice of where to look that carries no gradient. Raises ValueError for a cone without a
+    condenser's aperture, and as `effective_defocus` and `levels` do.
     """
     n0 = float(volume.background.detach())
     half_angle = None
@@ -99,8 +99,9 @@ def object_levels(
 def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None = None) -> Levels:
     """Levels for a field's δ (y, x) in µm, where the phase changes by at most `rate` rad per µm of it.
 
-    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. The levels themselves carry no gradient: but for rounding the field does not depend on them. Raises ValueError where
-    δ is not finite, or spans more than MOST_LEVELS.
+    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. The levels themselves carry
+    no gradient: but for rounding the field does not depend on them. Raises ValueError where δ is not finite, or asks
+    for more than MOST_LEVELS.
     """
     low, high = (float(v) for v in torch.aminmax(defocus.detach()))
     if not (math.isfinite(low) and math.isfinite(high)):
