@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 from data_synthetic import GaussianBall, GradedIndexRod, LayeredMedium
 from torchdic import Fidelity, Grid, Rays, Volume, launch, rays, trace
+from torchdic.rays import deviation
 
 N0 = 1.36
 DIRECTIONS = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, -0.5], [0.4, 0.6], [-0.7, 0.1]], dtype=torch.float64)
@@ -98,6 +99,121 @@ def test_interpolation_has_its_order_in_the_voxel_size(interpolation, order):
     coarse, half = (float((opd(n) - exact).square().mean().sqrt()) for n in (24, 48))
     assert math.log2(coarse / half) == pytest.approx(order, abs=0.5)
     assert half < 1e-2 * float(exact.abs().max())
+
+
+# --- polarisation carried along ---------------------------------------------------------------------------------------
+
+
+def carried(alpha, n0, x, p, length):
+    """E of a ray through the rod, started along the local x axis and carried by E' = −(E·t')t; and its local axes.
+
+    In three dimensions (x, y, z), along the ray of n² = n0²(1 − α²r²), solved to 1e-11.
+    """
+
+    def local_axes(t):
+        # the shortest turn of z to t, v ↦ v + w×v + w×(w×v)/(1 + cosθ) with w = z×t
+        w = np.cross([0, 0, 1], t)
+        axes = [v + np.cross(w, v) + np.cross(w, np.cross(w, v)) / (1 + t[2]) for v in np.eye(3)]
+        np.testing.assert_allclose(axes[2], t, atol=1e-12)
+        return np.stack(axes[:2])
+
+    def direction(p, pz):
+        return np.array([*p, pz]) / math.hypot(*p, pz)
+
+    pz = math.sqrt(n0**2 * (1 - alpha**2 * (x @ x)) - p @ p)
+
+    def motion(_z, state):
+        x, p, e = state[:2], state[2:4], state[4:]
+        bend = -(n0**2) * alpha**2 * x / pz
+        n = math.hypot(*p, pz)
+        # p_z is constant in the rod: t' = p'/n − (n'/n)t, of which E·t = 0 leaves the first
+        return [*(p / pz), *bend, *(-(e[:2] @ bend / n) * direction(p, pz))]
+
+    start = local_axes(direction(p, pz))[0]
+    end = solve_ivp(motion, (0, length), [*x, *p, *start], rtol=1e-11, atol=1e-12).y[:, -1]
+    return end[4:], local_axes(direction(end[2:4], pz))
+
+
+@pytest.mark.parametrize("given", [0.0, 0.4])
+def test_polarisation_is_carried_parallel_to_itself(given):
+    """Along skew rays of both hands in the rod, and two that cross its axis, one of them through θ = 0."""
+    _, _, volume = rod()
+    xy = np.array([[0.5, 0.1], [0.3, -0.7], [-0.8, 0.0], [0.0, 0.9], [0.4, 0.8]])
+    momentum = np.array([[0.02, 0.09], [0.03, 0.05], [0.0, 0.128], [0.0, 0.0], [0.04, 0.08]])
+    yx, p = (torch.from_numpy(v[:, ::-1].copy()) for v in (xy, momentum))
+    turn = torch.full((5,), given, dtype=torch.float64)
+    found = trace(
+        volume, Rays(yx, p, torch.zeros_like(turn), turn=turn), Fidelity("rays", steps=512, interpolation="cubic")
+    ).turn
+    for i in range(5):
+        field, axes = carried(0.1, 1.6, xy[i], momentum[i], 60.0)
+        expected = math.atan2(axes[1] @ field, axes[0] @ field)
+        # RK4 at 1/54 of an oscillation, its error 1e-8 and less
+        assert float(found[i]) - given == pytest.approx(expected, abs=1e-8)
+    # both hands turn, and rays in a plane with the axis do not
+    assert float(found[0]) - given > 5e-3
+    assert float(found[2]) - given < -5e-3
+    assert float((found[3:] - given).abs().max()) < 1e-8
+
+
+def test_turn_along_a_helix_is_its_solid_angle():
+    """One pitch of a circular helix: its direction circles z once at θ, and τ = ±2π(1 − cosθ)."""
+    alpha, n0, radius = 0.1, 1.6, 1.0
+    pz = n0 * math.sqrt(1 - 2 * (alpha * radius) ** 2)  # the axial momentum of a circular ray, whose |p| is n0·α·r
+    pitch = 2 * math.pi * pz / (n0 * alpha)
+    _, _, volume = rod(length=pitch)
+    # from (x, y) = (r, 0) towards +y: from +x towards +y, and the other way
+    p = n0 * alpha * radius * torch.tensor([[1.0, 0.0], [-1.0, 0.0]], dtype=torch.float64)
+    position = torch.tensor([[0.0, radius]], dtype=torch.float64).expand(2, 2)
+    start = Rays(position, p, torch.zeros(2, dtype=torch.float64), turn=torch.zeros(2, dtype=torch.float64))
+    found = trace(volume, start, Fidelity("rays", steps=512, interpolation="cubic"))
+    torch.testing.assert_close(found.position, start.position, rtol=0, atol=1e-6)
+    cosine = pz / math.hypot(pz, n0 * alpha * radius)
+    expected = 2 * math.pi * (1 - cosine) * torch.tensor([1.0, -1.0], dtype=torch.float64)
+    torch.testing.assert_close(found.turn, expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("options", [{}, {"memory": 1}, {"solver": "dopri5"}], ids=str)
+def test_turn_is_asked_for_and_changes_nothing_else(smooth_field, options):
+    grid = Grid((5, 8, 9), (0.4, 0.2, 0.2))
+    volume = Volume(grid, smooth_field(grid, 0.05), N0, 0.01 * smooth_field(grid, seed=1).abs())
+    start, fidelity = bundle(12, na=0.4), Fidelity("rays", **options)
+    plain = deviation(volume, start, fidelity)
+    turning = deviation(volume, start, fidelity, turn=True)
+    assert plain.turn is None
+    assert trace(volume, start, fidelity).turn is None
+    assert float(turning.turn.abs().min()) > 0
+    # an adaptive solver holds τ to its tolerance too, by other steps
+    tolerance = 1e-5 if "solver" in options else 0
+    for name in ("position", "momentum", "opd", "absorbed"):
+        torch.testing.assert_close(getattr(turning, name), getattr(plain, name), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_gradient_of_turn_is_the_central_difference(smooth_field, interpolation):
+    grid = Grid((4, 8, 9), (0.6, 0.22, 0.2))
+    start = bundle(20, na=0.4)
+    weights = torch.rand(20, dtype=torch.float64)
+
+    def of(delta, background):
+        found = deviation(
+            Volume(grid, delta, background), start, Fidelity("rays", interpolation=interpolation), turn=True
+        )
+        return (weights * found.turn).sum()
+
+    point = [smooth_field(grid, 0.04), torch.tensor(N0, dtype=torch.float64)]
+    for i in range(2):
+        values = [v.clone().requires_grad_(i == j) for j, v in enumerate(point)]
+        (gradient,) = torch.autograd.grad(of(*values), values[i])
+        direction = torch.randn_like(gradient).abs() * torch.where(gradient < 0, -1.0, 1.0)
+        step = 1e-5
+
+        def at(t, i=i, direction=direction, step=step):
+            return float(of(*(v + t * step * direction if i == j else v for j, v in enumerate(point))))
+
+        expected = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+        assert abs(expected) > 1e-4
+        assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-6)
 
 
 # --- Snell's law ---------------------------------------------------------------------------------------------------

@@ -23,16 +23,25 @@ LEAST_TUBE = 1e-3
 
 
 def ray_field(
-    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
-) -> Complex[Tensor, "source y x"]:
+    volume: Volume,
+    wavelength: float,
+    momentum: Float[Tensor, "source 2"],
+    plane: float,
+    fidelity: Fidelity,
+    *,
+    turned: bool = False,
+) -> Complex[Tensor, "source *component y x"]:
     """Each source's envelope at depth `plane` (µm), from rays traced through the volume.
 
     Inside a triangle of the mesh the OPD is Σ w_i [W_i + ½ δp_i·(X − x_i)] with barycentric weights w_i, third order in
     the mesh, and the amplitude is √(p_z0/(p_z·|det ∂x_r/∂x0|)), which conserves energy.
+
+    turned: whether rays carry their polarisation. The field is then (source, 2, y, x), its components along +x and +y
+    of each ray's local frame for light that comes in along +x: (cos τ, sin τ) times the envelope (see `torchdic.rays`).
     """
     grid, n0 = volume.grid, volume.background
     p0 = momentum[:, None, None, :]
-    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity)
+    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity, turn=turned)
     landed = extend(leaving, p0, n0, plane - grid.extent[0] / 2)
     tube = None
     if fidelity.amplitude:
@@ -69,8 +78,15 @@ def ray_field(
 
     ny, nx = grid.shape[1:]
     target = (source * ny + pixel[:, 0]) * nx + pixel[:, 1]
-    field = branches.new_zeros(len(momentum) * ny * nx).index_add(0, target, branches)
-    return field.reshape(len(momentum), ny, nx)
+
+    def summed(branches: Tensor) -> Tensor:
+        field = branches.new_zeros(len(momentum) * ny * nx).index_add(0, target, branches)
+        return field.reshape(len(momentum), ny, nx)
+
+    if landed.turn is None:
+        return summed(branches)
+    turn = (weight * corners(landed.turn)).sum(-1)
+    return torch.stack((summed(branches * turn.cos()), summed(branches * turn.sin())), 1)
 
 
 def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviation:
@@ -81,7 +97,7 @@ def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviatio
     q = -(dp * (p + p0)).sum(-1) / (pz + pz0)
     slope = (dp - p0 * (q / pz0)[..., None]) / pz[..., None]
     lengthening = (dp.square().sum(-1) + q * q) / (2 * pz)
-    return Deviation(rays.position + distance * slope, dp, rays.opd + distance * lengthening, rays.absorbed)
+    return Deviation(rays.position + distance * slope, dp, rays.opd + distance * lengthening, rays.absorbed, rays.turn)
 
 
 def tube_area(displacement: Float[Tensor, "source y x 2"], grid: Grid) -> Float[Tensor, "source y x"]:

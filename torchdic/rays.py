@@ -10,6 +10,12 @@ unperturbed plane wave: the absolute ones would lose the phase to rounding. With
 B = n² − n0² and q = p_z − p_z0 = (B − δp·(p + p0))/(p_z + p_z0):
 
     dδx/dz = (δp − q p0/p_z0)/p_z,    dW/dz = (B + |δp|² + q²)/(2 p_z).
+
+The transverse electric field E is carried parallel to itself along a ray, E' = −(E·t')t for the direction t (Rytov's
+law). Seen in the frame got from (x, y, z) by the shortest turn of z to t, it turns by τ from +x towards +y: directions
+sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
+
+    dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)),    without the singularity of s and p on the axis.
 """
 
 from dataclasses import dataclass, replace
@@ -35,23 +41,27 @@ class Rays:
     """Rays that cross one plane of constant z.
 
     position: (…, 2) in µm. momentum: (…, 2), n·(transverse direction). opd: (…) in µm, the difference from each ray's
-    own unperturbed plane wave. absorbed: (…), ∫κ ds in µm along the ray, or None where nothing absorbs.
+    own unperturbed plane wave. absorbed: (…), ∫κ ds in µm along the ray, or None where nothing absorbs. turn: (…), τ
+    in rad, how far the electric field has turned from +x towards +y in the frame local to the ray (the module's head),
+    or None where no one asks.
     """
 
     position: Float[Tensor, "*ray 2"]
     momentum: Float[Tensor, "*ray 2"]
     opd: Float[Tensor, " *ray"]
     absorbed: Float[Tensor, " *ray"] | None = None
+    turn: Float[Tensor, " *ray"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
-    """How rays differ from their unperturbed selves at one plane: δx (…, 2), δp (…, 2), W (…), ∫κ ds (…) or None."""
+    """How rays differ from their unperturbed selves at one plane: δx, δp (…, 2), W (…), ∫κ ds and τ (…) or None."""
 
     position: Tensor
     momentum: Tensor
     opd: Tensor
     absorbed: Tensor | None
+    turn: Tensor | None = None
 
 
 def axial_momentum(background: Float[Tensor, " *#ray"], momentum: Float[Tensor, "*#ray 2"]) -> Float[Tensor, " *#ray"]:
@@ -79,9 +89,10 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     """Rays from the volume's first face, z = −nz·dz/2, to its last, z = +nz·dz/2.
 
     Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (its momentum at the start, in the
-    background). Raises TurnedRaysError where a ray can't go on toward +z: the index falls to its transverse momentum.
+    background), and their `turn`, if they have one, by τ. Raises TurnedRaysError where a ray can't go on toward +z: the
+    index falls to its transverse momentum.
     """
-    change = deviation(volume, rays, fidelity)
+    change = deviation(volume, rays, fidelity, turn=rays.turn is not None)
     slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
     absorbed = change.absorbed
     if absorbed is not None and rays.absorbed is not None:
@@ -91,11 +102,15 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
         rays.momentum + change.momentum,
         rays.opd + change.opd,
         absorbed,
+        None if rays.turn is None or change.turn is None else rays.turn + change.turn,
     )
 
 
-def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
-    """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`."""
+def deviation(volume: Volume, rays: Rays, fidelity: Fidelity, *, turn: bool = False) -> Deviation:
+    """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`.
+
+    turn: whether to find τ too.
+    """
     grid, n0 = volume.grid, volume.background
     fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
     if fidelity.interpolation == "cubic":
@@ -130,6 +145,8 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
             ]
             if len(samplers) == 2:
                 change.append(samplers[1].value(z, y, x) * bend)
+            if turn:
+                change.append((px * gradient_y - py * gradient_x) / (pz * (n + pz)))
             return torch.stack(change)
 
         ends = torch.tensor((z0, z1), dtype=state.dtype, device=state.device)
@@ -145,7 +162,7 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
         assert isinstance(path, Tensor)
         return path[-1]
 
-    state = torch.zeros_like(y0 + py0).expand(4 + len(fields), *torch.broadcast_shapes(y0.shape, py0.shape))
+    state = torch.zeros_like(y0 + py0).expand(4 + len(fields) + turn, *torch.broadcast_shapes(y0.shape, py0.shape))
     steps = fidelity.steps or grid.shape[0]
     crowded = kept_by_rays(grid, fidelity) * state[0].numel() * state.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded and fidelity.solver not in ADAPTIVE):
@@ -158,7 +175,8 @@ def deviation(volume: Volume, rays: Rays, fidelity: Fidelity) -> Deviation:
             "inside the volume the index falls to their transverse momentum"
         )
     position, momentum = state[:2].movedim(0, -1), state[2:4].movedim(0, -1)
-    return Deviation(position, momentum, state[4], state[5] if len(state) == 6 else None)
+    absorbed = None if volume.absorption is None else state[5]
+    return Deviation(position, momentum, state[4], absorbed, state[-1] if turn else None)
 
 
 def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:

@@ -41,24 +41,35 @@ class SliceSampler:
         self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
     ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
         """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
-        field = self._blend(z)
+        field, (dy, dx) = self._blend(z), self.grid.spacing[1:]
         if self.interpolation == "cubic":
             value, slope_y, slope_x = _sample_cubic(field, *self._indices(y, x))
+            slope_y, slope_x = slope_y / dy, slope_x / dx
         else:
             # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
             padded = F.pad(field[None], (2, 2, 2, 2), mode="replicate")[0]
-            differences_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-            differences_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
-            channels = torch.stack((padded[1:-1, 1:-1], differences_y, differences_x))
-            value, slope_y, slope_x = _sample_linear(channels, *(i + 1 for i in self._indices(y, x)))
-        return value, slope_y / self.grid.spacing[1], slope_x / self.grid.spacing[2]
+            slopes_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * dy)
+            slopes_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * dx)
+            value, slope_y, slope_x = self._linear(torch.stack((padded[1:-1, 1:-1], slopes_y, slopes_x)), y, x)
+        return value, slope_y, slope_x
 
     def value(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, " *ray"]:
         """The field alone at depth z and positions (y, x) in µm."""
         field = self._blend(z)
         if self.interpolation == "cubic":
             return _sample_cubic(field, *self._indices(y, x))[0]
-        return _sample_linear(field[None], *self._indices(y, x))[0]
+        return self._linear(field[None], y, x)[0]
+
+    def _linear(self, channels: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        """Channels (c, y, x), centred on the grid, at positions in µm: shape (c, …)."""
+        for axis in (1, 2):  # grid_sample's coordinates, −1 … 1, need two points to stand on
+            if channels.shape[axis] == 1:
+                channels = channels.repeat_interleave(2, axis)
+        ny, nx = channels.shape[1:]
+        dy, dx = self.grid.spacing[1:]
+        where = torch.stack((x * (2 / (dx * (nx - 1))), y * (2 / (dy * (ny - 1)))), -1).reshape(1, 1, -1, 2)
+        sampled = F.grid_sample(channels[None], where, padding_mode="border", align_corners=True)
+        return sampled.reshape(len(channels), *y.shape)
 
     def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
@@ -66,7 +77,11 @@ class SliceSampler:
 
     def _blend(self, z: float) -> Float[Tensor, "y x"]:
         weights = depth_weights(self.grid, z, self.interpolation)
-        return sum(weight * self.slices[i - self.first] for i, weight in weights.items())  # pyright: ignore[reportReturnType]
+        (first, weight), *others = weights.items()
+        field = self.slices[first - self.first] * weight
+        for i, weight in others:
+            field = field.add(self.slices[i - self.first], alpha=weight)
+        return field
 
 
 def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:
@@ -110,17 +125,6 @@ def _mirror(i: int, last: int) -> int:
 
 def _bspline(t: float) -> tuple[float, float, float, float]:
     return ((1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (1 + 3 * t + 3 * t**2 - 3 * t**3) / 6, t**3 / 6)
-
-
-def _sample_linear(channels: Tensor, iy: Tensor, ix: Tensor) -> Tensor:
-    """Channels (c, y, x) at fractional indices: shape (c, …)."""
-    for axis in (1, 2):  # grid_sample's coordinates, −1 … 1, need two points to stand on
-        if channels.shape[axis] == 1:
-            channels = channels.repeat_interleave(2, axis)
-    ny, nx = channels.shape[1:]
-    normalised = torch.stack((ix * (2 / (nx - 1)) - 1, iy * (2 / (ny - 1)) - 1), -1).reshape(1, 1, -1, 2)
-    sampled = F.grid_sample(channels[None], normalised, padding_mode="border", align_corners=True)
-    return sampled.reshape(len(channels), *iy.shape)
 
 
 def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
