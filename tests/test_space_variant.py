@@ -75,6 +75,14 @@ def test_levels_are_the_sum_over_object_points_to_rounding(span):
     torch.testing.assert_close(found, expected, rtol=0, atol=eps * float(field.abs().max()))
 
 
+def test_components_of_a_field_spread_alike():
+    field, defocus, difference = scene()
+    shared = levels(defocus, K0 * N0)
+    both = shared.spread(torch.stack((field, 2j * field), 1), WAVELENGTH, difference)
+    alone = shared.spread(field, WAVELENGTH, difference)
+    torch.testing.assert_close(both, torch.stack((alone, 2j * alone), 1), rtol=1e-13, atol=1e-13)
+
+
 def test_error_falls_with_the_levels_as_the_bound_does():
     """8·(b/2)^K/K!: geometric and better; each tolerance is met, and by no more than a few levels."""
     field, defocus, difference = scene()
@@ -257,11 +265,12 @@ def test_recomputed_gradient_is_the_kept_one(smooth_field, fidelity):
     torch.testing.assert_close(gradient(1), gradient(1 << 30), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("learned", ["delta", "background"])
+@pytest.mark.parametrize("learned", [("delta",), ("background",), ("delta", "background")], ids="-".join)
 def test_levels_keep_no_more_than_they_count(learned):
     """Beyond what imaging keeps: each level's share of every source, and the map's own for all of them."""
     field, defocus, difference = scene()
-    (defocus if learned == "delta" else difference).requires_grad_()
+    for name, value in (("delta", defocus), ("background", difference)):
+        value.requires_grad_(name in learned)
     shared = levels(defocus, K0 * N0)
     held = {}
 

@@ -32,7 +32,7 @@ from torch import Tensor
 from torchdic.fidelity import ADAPTIVE, AberrationMethod, Fidelity, Solver
 from torchdic.rays import axial_momentum, kept_by_rays
 from torchdic.recompute import recompute, slabs
-from torchdic.sampling import SliceSampler, _spline_taps, spline_coefficients, window
+from torchdic.sampling import SliceSampler, spline_coefficients, spline_taps, window
 from torchdic.volume import Volume
 
 CAREFUL = Fidelity("rays", interpolation="cubic")
@@ -208,7 +208,7 @@ class _CurvedSampler(SliceSampler):
         field = self._blend(z)
         (ny, nx), (dy, dx) = field.shape, self.grid.spacing[1:]
         iy, ix = self._indices(y, x)
-        (rows, wy, sy), (columns, wx, sx) = _spline_taps(iy, ny), _spline_taps(ix, nx)
+        (rows, wy, sy), (columns, wx, sx) = spline_taps(iy, ny), spline_taps(ix, nx)
         patch = field.reshape(-1)[rows[..., :, None] * nx + columns[..., None, :]]
         along_x = (patch * wx[..., None, :]).sum(-1)
         slope_x = (patch * sx[..., None, :]).sum(-1)

@@ -20,7 +20,7 @@ class Fidelity:
     propagation: how light crosses the specimen: "projection" along straight rays, "rays" along bent ones (the ray ODE),
         "wave" by the split-step solution of the one-way wave equation.
     steps: equal steps (rays) or slabs (wave) through the whole volume; None is one per slice. Fewer average slices,
-        more subdivide them. Projection ignores it.
+        more subdivide them. Projection ignores it, but for its object_aberration.
     sources: condenser directions at most, where the condenser names no points of its own.
     interpolation: between voxel centres, "linear" or "cubic" (C² spline); the wave reads voxels as they are.
     solver: torchdiffeq's method for rays. The adaptive ones (bosh3, dopri5, dopri8) hold every single ray to
@@ -32,7 +32,8 @@ class Fidelity:
         −(|p|² − |p0|²)/(2n0), as earlier models have it; inside the specimen waves are exact in either case.
     object_aberration: how the specimen's own defocus of each object point is found, with which it then spreads
         (Kagalwala & Kanade, Eq. 6): "linear" around an axial ray, "cone" over the condenser's aperture; None leaves it
-        out. It stands in for the amplitude that straight rays lack, or bent ones without `amplitude`.
+        out. Found once an image, by rk4 in `steps` through a cubic spline. It stands in for the amplitude that straight
+        rays lack, or bent ones without `amplitude`, and makes up for about half of it.
     reference_plane: depth in µm at which rays are turned into a field; None is the slice's centre or face nearest to
         the |Δn|-weighted mean depth.
     padding: voxels of the medium around the volume's sides on each side during the computation.

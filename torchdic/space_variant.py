@@ -43,12 +43,13 @@ class Levels:
 
     def spread(
         self,
-        field: Complex[Tensor, "source y x"],
+        field: Complex[Tensor, "source *component y x"],
         wavelength: float,
         difference: Float[Tensor, "source y x"],
-    ) -> Complex[Tensor, "source y x"]:
+    ) -> Complex[Tensor, "source *component y x"]:
         """Spectrum of a field whose points spread each with its own defocus; difference: p_z(f + f_s) − p_z0."""
         k0 = 2 * math.pi / wavelength
+        difference = difference.reshape(len(difference), *[1] * (field.ndim - 3), *difference.shape[1:])
         parts = (
             to_spectrum(field * share) * exp_i(-k0 * defocus * difference)
             for defocus, share in zip(self.defocus, self.share, strict=True)
