@@ -5,6 +5,10 @@
 A row for the method and for the method with one part changed; the error is the rms difference from the exact image
 over that image's standard deviation, at each focus plane. The reference was made on a periodic array of 256 × 256
 pixels and cropped to 128, so the model is run on as many.
+
+A second table is of the specimen's own defocus of each object point, Kagalwala & Kanade's Eq. 6, on the smooth ball and
+on the sharp bead of tests/data/exact_sphere_dic.npz, unpadded: what it gives to rays without amplitude, straight and
+bent, and what it does to those that carry theirs, which `Fidelity` refuses.
 """
 
 import math
@@ -20,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from data_synthetic import GaussianBall
+from data_synthetic import Bead, GaussianBall
 from torchdic import (
     Acquisition,
     Condenser,
@@ -34,7 +38,12 @@ from torchdic import (
     image_field,
     landing,
 )
+from torchdic.aberration import effective_defocus
+from torchdic.fidelity import AberrationMethod
+from torchdic.microscope import form_image
+from torchdic.projection import project
 from torchdic.rays import Deviation, axial_momentum
+from torchdic.space_variant import levels
 from torchdic.wave import axial_difference, exp_i, slab_mean, to_field, to_spectrum
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
@@ -49,16 +58,17 @@ class Scene:
     """The exact images (prism, focus, y, x), what they show, and how they were taken."""
 
     images: Tensor
-    ball: GaussianBall
+    specimen: GaussianBall | Bead
+    depth: float
     spacing: float
     microscope: Microscope
     acquisition: Acquisition
 
     def volume(self, slices: int) -> Volume:
-        """The ball in float32 on `slices` slices of DEPTH."""
+        """The specimen in float32 on `slices` slices of its depth."""
         ny, nx = self.images.shape[2:]
-        grid = Grid((slices, ny, nx), (DEPTH / slices, self.spacing, self.spacing))
-        return Volume(grid, self.ball.delta(grid, dtype=torch.float32), self.ball.background)
+        grid = Grid((slices, ny, nx), (self.depth / slices, self.spacing, self.spacing))
+        return Volume(grid, self.specimen.delta(grid, dtype=torch.float32), self.specimen.background)
 
     def errors(self, images: Tensor) -> list[float]:
         """The largest error over the prisms at each focus plane."""
@@ -67,15 +77,32 @@ class Scene:
 
 
 def read() -> Scene:
-    with np.load(DATA / "exact_ball_dic.npz") as file:
-        data = {key: file[key] for key in file.files}
-    n0 = float(data["n_medium"])
-    points = torch.from_numpy(data["source_yx"]) * n0
+    """The smooth ball."""
+    data = _load("exact_ball_dic")
+    ball = GaussianBall(float(data["sigma"]), float(data["delta_peak"]), float(data["n_medium"]))
+    return _scene(data, ball, DEPTH)
+
+
+def read_bead() -> Scene:
+    """The sharp bead."""
+    data = _load("exact_sphere_dic")
+    n0, radius = float(data["n_medium"]), float(data["radius"])
+    return _scene(data, Bead(radius, float(data["n_sphere"]) - n0, n0), 2 * radius)
+
+
+def _load(name: str) -> dict:
+    with np.load(DATA / f"{name}.npz") as file:
+        return {key: file[key] for key in file.files}
+
+
+def _scene(data: dict, specimen: GaussianBall | Bead, depth: float) -> Scene:
+    points = torch.from_numpy(data["source_yx"]) * specimen.background
     condenser = Condenser(float(points.norm(dim=1).max()), points)
     prisms = [Prism((float(s[0]), float(s[1])), float(b)) for s, b in zip(data["shear_yx"], data["bias"], strict=True)]
     return Scene(
         torch.from_numpy(data["images"]),
-        GaussianBall(float(data["sigma"]), float(data["delta_peak"]), n0),
+        specimen,
+        depth,
         float(data["spacing"]),
         Microscope(float(data["wavelength"]), Objective(float(data["na_objective"])), condenser),
         Acquisition(prisms, [float(f) for f in data["focus"]]),
@@ -144,8 +171,69 @@ def ablation(name: Name, scene: Scene, slices: int, rays: Fidelity, padding: int
         return scene.errors(trials[name]())
 
 
+def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMethod, times: float = 1.0) -> list[float]:
+    """Errors of a field of rays, of whatever amplitude, whose points spread with `times` their own defocus.
+
+    It puts together what `image` does, and what it refuses: rays with amplitude, which have the defocus already.
+    """
+    volume, microscope = scene.volume(slices), scene.microscope
+    assert microscope.condenser is not None
+    assert microscope.objective is not None
+    plane, n0 = volume.mean_plane(), volume.background
+    momentum, weights = microscope.sources(rays, dtype=torch.float32, device=volume.delta.device)
+    half_angle = math.asin(microscope.condenser.na / float(n0)) if method == "cone" else None
+    careful = Fidelity("rays", interpolation="cubic", steps=rays.steps)
+    field = project if rays.propagation == "projection" else landing.ray_field
+    with torch.no_grad():
+        defocus = times * effective_defocus(volume, plane, fidelity=careful, method=method, half_angle=half_angle)
+        rate = float(n0 - (n0**2 - microscope.objective.na**2).sqrt()) * 2 * math.pi / microscope.wavelength
+        difference, _ = axial_difference(volume.grid, microscope.wavelength, n0, momentum)
+        at_plane = field(volume, microscope.wavelength, momentum, plane, rays)
+        spectrum = levels(defocus, rate).spread(at_plane, microscope.wavelength, difference)
+        images = form_image(spectrum, volume.grid, n0, plane, momentum, weights, microscope, scene.acquisition)
+    return scene.errors(images)
+
+
+def print_row(label: str, errors: Callable[[], list[float]]) -> None:
+    """A row of the table, and how long it took."""
+    start = time.perf_counter()
+    row = "  ".join(f"{e:8.4f}" for e in errors())
+    print(f"{label:<44}{row}   {time.perf_counter() - start:7.1f}", flush=True)
+
+
+def print_own_defocus(title: str, scene: Scene, slices: int) -> None:
+    """The table of Eq. 6 for one specimen."""
+    straight = Fidelity("projection", steps=40)
+    bent = Fidelity("rays", steps=40, amplitude=False)
+    print_head(f"Eq. 6, {title}", scene)
+    for name, rays in (("straight rays", straight), ("bent rays, no amplitude", bent)):
+        for label, fidelity in (
+            (name, rays),
+            (f"{name}, Eq. 6 linear", replace(rays, object_aberration="linear")),
+            (f"{name}, Eq. 6 cone", replace(rays, object_aberration="cone")),
+        ):
+            print_row(label, lambda fidelity=fidelity: whole(scene, slices, fidelity))
+    print_row("straight rays, Eq. 6 cone, twice its defocus", lambda: own_defocus(scene, slices, straight, "cone", 2.0))
+    with_ = replace(bent, amplitude=True)
+    print_row("bent rays with amplitude", lambda: whole(scene, slices, with_))
+    for method in ("linear", "cone"):
+        print_row(f"the same and Eq. 6 {method}", lambda method=method: own_defocus(scene, slices, with_, method))
+
+
+def whole(scene: Scene, slices: int, fidelity: Fidelity) -> list[float]:
+    """Errors of `image` itself."""
+    with torch.no_grad():
+        return scene.errors(image(scene.volume(slices), scene.microscope, scene.acquisition, fidelity))
+
+
+def print_head(title: str, scene: Scene) -> None:
+    """The table's first line."""
+    focus = "  ".join(f"z={float(f):+.0f} µm" for f in scene.acquisition.focus)
+    print(f"{title:<44}{focus}   seconds")
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     scene = read()
     fine = Fidelity("rays", padding=PADDING, interpolation="linear")
     rows: list[tuple[str, Name, int, Fidelity]] = [
@@ -158,12 +246,13 @@ def main() -> None:
         ("split step, screen k0·Δn·dz/cosθ, 0.15 µm", "textbook screen", 120, fine),
         ("split step, corrected, 1 µm", "split step", 18, fine),
     ]
-    focus = "  ".join(f"z={float(f):+.0f} µm" for f in scene.acquisition.focus)
-    print(f"{'':<44}{focus}   seconds")
+    print_head("smooth ball", scene)
     for label, name, slices, rays in rows:
-        start = time.perf_counter()
-        row = "  ".join(f"{e:8.4f}" for e in ablation(name, scene, slices, rays, PADDING))
-        print(f"{label:<44}{row}   {time.perf_counter() - start:7.1f}", flush=True)
+        print_row(label, lambda name=name, slices=slices, rays=rays: ablation(name, scene, slices, rays, PADDING))
+    print()
+    print_own_defocus("smooth ball", scene, 120)
+    print()
+    print_own_defocus("sharp bead", read_bead(), 80)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ LAYERS = (
     "jones",
     "prism",
     "objective",
+    "space_variant",
     "camera",
     "microscope",
     "weak",

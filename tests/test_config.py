@@ -156,6 +156,16 @@ def test_every_section_is_read(write):
     assert config.specimen == {"kind": "bead", "radius": 2.5, "contrast": 0.03}
 
 
+@pytest.mark.parametrize("method", ["linear", "cone", None])
+def test_defocus_and_object_aberration_are_read_and_dumped(write, tmp_path, method):
+    options = {"propagation": "projection", "defocus": "paraxial", "object_aberration": method or "none"}
+    config = load(write(changed("fidelity", options)))
+    assert config.fidelity == Fidelity("projection", defocus="paraxial", object_aberration=method)
+    again = tmp_path / "again.toml"
+    again.write_text(dump(config), encoding="utf-8")
+    assert equal(load(again), config)
+
+
 def test_a_whole_number_serves_as_a_float(write):
     config = load(write(CONTRACT.replace("background = 1.56", "background = 2").replace("-4.0,", "-4,")))
     assert config.volume.background == 2.0
@@ -276,6 +286,8 @@ def test_a_key_that_is_unknown_or_missing_is_named(write, key, value, message):
         ("reconstruction.steps", True, "must be a whole number"),
         ("fidelity.sources", "12", "must be a whole number"),
         ("fidelity.propagation", "waves", "must be one of 'projection', 'rays', 'wave'"),
+        ("fidelity.defocus", "parabolic", "must be one of 'exact', 'paraxial'"),
+        ("fidelity.object_aberration", "sphere", "must be one of 'linear', 'cone'"),
         ("fidelity.order", True, "must be one of 1, 2"),
         ("fidelity.order", 3, "must be one of 1, 2"),
         ("reconstruction.start", "linaer", "must be one of 'linear', 'zero'"),
@@ -344,6 +356,12 @@ def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, nam
         ("acquisition.prisms.0.shear", [0, math.inf], ["acquisition.prisms[0]", "shear x inf", "finite"]),
         ("fidelity.sources", 0, ["fidelity", "sources 0", "at least 1"]),
         ("fidelity.steps", 0, ["fidelity", "steps 0", "at least 1"]),
+        ("fidelity.object_aberration", "cone", ["fidelity", "'cone' has no use", "wave"]),
+        (
+            "fidelity",
+            {"propagation": "rays", "object_aberration": "linear"},
+            ["fidelity", "double-counts", "amplitude must be false"],
+        ),
         ("fidelity.padding", -1, ["fidelity", "padding -1", "at least 0"]),
         ("reconstruction.steps", 0, ["reconstruction", "steps 0", "at least 1"]),
         ("reconstruction.learning_rate", -1, ["reconstruction", "learning_rate -1", "above 0"]),

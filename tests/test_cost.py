@@ -26,6 +26,7 @@ from torchdic import (
 )
 from torchdic.recompute import TRANSIENT
 from torchdic.sampling import SliceSampler
+from torchdic.space_variant import object_levels
 
 N0 = 1.36
 SLICES, ROWS, COLUMNS = 5, 24, 30
@@ -232,6 +233,8 @@ ABSENT = {
     "camera": ({"camera": None}, {}),
     "camera-of-voxels": ({"camera": Camera(photons=1e4, read_noise=2.0, bits=12, offset=3.0)}, {}),
     "padding": ({}, {"padding": 0}),
+    "object-aberration": ({}, {"object_aberration": None}),
+    "exact-defocus": ({}, {"defocus": "exact"}),
     "absorption": ({}, {"absorption": None}),
 }
 
@@ -282,6 +285,42 @@ def test_what_is_present_costs_its_own(delta, counted, parts, extra):
         assert peak(declared) == peak(plain)
     else:
         assert peak(plain) < peak(declared) <= peak(plain) + 3 * FIELDS
+
+
+@pytest.mark.parametrize("method", ["linear", "cone"])
+@pytest.mark.parametrize("options", [{"propagation": "projection"}, {"propagation": "rays", "amplitude": False}])
+def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level(delta, counted, options, method):
+    """Whatever the number of sources, prisms and focus planes; Δn is sampled from the object's plane to the last face.
+
+    The curvature of "linear" is sampled beside the value and its gradient, not by a call of its own.
+    """
+    plain = counted(taking(delta, **options))
+    without = taking(delta, **options, reference_plane=0.0)
+    present = taking(delta, **options, reference_plane=0.0, object_aberration=method)
+    map_ = Counter(sample=4 * math.ceil(SLICES / 2))
+    extra = Counter(counted(present)) - Counter(plain)
+    found = object_levels(
+        Volume(GRID, delta, N0),
+        0.0,
+        0.546,
+        SCOPE.objective,
+        SCOPE.condenser,
+        POINTS,
+        Fidelity(**options, object_aberration=method),
+    )
+    assert extra == map_ + Counter(fft2=len(found.defocus) - 1)
+    assert 8 < len(found.defocus) < 12
+    many = taking(delta, directions(8), **options, reference_plane=0.0, object_aberration=method)
+    assert counted(many) == counted(present)
+    assert float((present() - without()).abs().max()) > 1e-4
+    kept_, more = (kept(taking(delta, learned=True, **options, object_aberration=m)) for m in (None, method))
+    assert kept_ < more
+
+
+def test_paraxial_defocus_costs_no_transform(delta, counted, propagation):
+    exact, paraxial = (taking(delta, propagation=propagation, defocus=d) for d in ("exact", "paraxial"))
+    assert counted(exact) == counted(paraxial)
+    assert float((exact() - paraxial()).abs().max()) > 1e-4
 
 
 def test_pupil_is_cut_only_by_an_objective(delta, counted, monkeypatch):

@@ -23,19 +23,18 @@ m = ½ tr M the sharp plane is f = z_e − cosθ·m/(1 − cm).
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchdic.fidelity import ADAPTIVE, Fidelity, Solver
+from torchdic.fidelity import ADAPTIVE, AberrationMethod, Fidelity, Solver
 from torchdic.rays import axial_momentum, kept_by_rays
 from torchdic.recompute import recompute, slabs
-from torchdic.sampling import SliceSampler, _spline_taps, spline_coefficients, window
+from torchdic.sampling import SliceSampler, spline_coefficients, spline_taps, window
 from torchdic.volume import Volume
 
-Method = Literal["linear", "cone"]
 CAREFUL = Fidelity("rays", interpolation="cubic")
 # Rays of a cone: rings at these fractions of its half angle, with so many rays each, in opposite pairs (no coma).
 RINGS = (0.5, 1.0)
@@ -101,7 +100,7 @@ def effective_defocus(
     fidelity: Fidelity = CAREFUL,
     *,
     points: Float[Tensor, "*#point 2"] | None = None,
-    method: Method = "linear",
+    method: AberrationMethod = "linear",
     half_angle: float | None = None,
     lens: float = math.inf,
 ) -> Float[Tensor, " *point"]:
@@ -121,7 +120,7 @@ def wavefront(
     fidelity: Fidelity = CAREFUL,
     *,
     points: Float[Tensor, "*#point 2"] | None = None,
-    method: Method = "linear",
+    method: AberrationMethod = "linear",
     half_angle: float | None = None,
     lens: float = math.inf,
 ) -> Wavefront:
@@ -165,7 +164,7 @@ def wavefront(
 
 
 def _check(
-    volume: Volume, plane: float, fidelity: Fidelity, method: Method, half_angle: float | None, lens: float
+    volume: Volume, plane: float, fidelity: Fidelity, method: AberrationMethod, half_angle: float | None, lens: float
 ) -> None:
     face = volume.grid.extent[0] / 2
     if not -face <= plane <= face:
@@ -176,8 +175,8 @@ def _check(
         raise ValueError(
             f"solver {fidelity.solver!r} adapts its steps; curvature takes equal ones: {', '.join(METHODS)}"
         )
-    if method not in get_args(Method):
-        raise ValueError(f"method {method!r} must be one of {', '.join(map(repr, get_args(Method)))}")
+    if method not in get_args(AberrationMethod):
+        raise ValueError(f"method {method!r} must be one of {', '.join(map(repr, get_args(AberrationMethod)))}")
     if method == "linear":
         if half_angle is not None:
             raise ValueError(f'half_angle {half_angle} rad has no use in method "linear", a cone of no width')
@@ -209,7 +208,7 @@ class _CurvedSampler(SliceSampler):
         field = self.plane(z)
         (ny, nx), (dy, dx) = field.shape, self.grid.spacing[1:]
         iy, ix = self._indices(y, x)
-        (rows, wy, sy), (columns, wx, sx) = _spline_taps(iy, ny), _spline_taps(ix, nx)
+        (rows, wy, sy), (columns, wx, sx) = spline_taps(iy, ny), spline_taps(ix, nx)
         patch = field.reshape(-1)[rows[..., :, None] * nx + columns[..., None, :]]
         along_x = (patch * wx[..., None, :]).sum(-1)
         slope_x = (patch * sx[..., None, :]).sum(-1)

@@ -8,6 +8,8 @@ from torchdic.sampling import Interpolation
 
 Propagation = Literal["projection", "rays", "wave"]
 Solver = Literal["euler", "midpoint", "rk4", "bosh3", "dopri5", "dopri8"]
+Defocus = Literal["exact", "paraxial"]
+AberrationMethod = Literal["linear", "cone"]
 ADAPTIVE: frozenset[Solver] = frozenset({"bosh3", "dopri5", "dopri8"})
 
 
@@ -18,7 +20,7 @@ class Fidelity:
     propagation: how light crosses the specimen: "projection" along straight rays, "rays" along bent ones (the ray ODE),
         "wave" by the split-step solution of the one-way wave equation.
     steps: equal steps (rays) or slabs (wave) through the whole volume; None is one per slice. Fewer average slices,
-        more subdivide them. Projection ignores it.
+        more subdivide them. Projection ignores it, but for its object_aberration.
     sources: condenser directions at most, where the condenser names no points of its own.
     interpolation: between voxel centres, "linear" or "cubic" (C² spline); the wave reads voxels as they are.
     solver: torchdiffeq's method for rays. The adaptive ones (bosh3, dopri5, dopri8) hold every single ray to
@@ -26,6 +28,12 @@ class Fidelity:
     tolerance: largest local error of an adaptive solver, absolute in µm and relative.
     amplitude: whether rays carry their energy's amplitude; False is for studying what it does.
     order: of the split step: 2 (4 FFTs a slab) or 1 (2 FFTs).
+    defocus: from where light leaves the specimen to the plane of focus: "exact", by p_z − p_z0, or "paraxial", by
+        −(|p|² − |p0|²)/(2n0), as earlier models have it; inside the specimen waves are exact in either case.
+    object_aberration: how the specimen's own defocus of each object point is found, with which it then spreads
+        (Kagalwala & Kanade, Eq. 6): "linear" around an axial ray, "cone" over the condenser's aperture; None leaves it
+        out. Found once an image, by rk4 in `steps` through a cubic spline. It stands in for the amplitude that straight
+        rays lack, or bent ones without `amplitude`, and makes up for about half of it.
     reference_plane: depth in µm at which rays are turned into a field; None is the slice's centre or face nearest to
         the |Δn|-weighted mean depth.
     padding: voxels of the medium around the volume's sides on each side during the computation.
@@ -41,6 +49,8 @@ class Fidelity:
     tolerance: float = 1e-6
     amplitude: bool = True
     order: Literal[1, 2] = 2
+    defocus: Defocus = "exact"
+    object_aberration: AberrationMethod | None = None
     reference_plane: float | None = None
     padding: int = 0
     memory: int = 1 << 30
@@ -51,10 +61,22 @@ class Fidelity:
             ("interpolation", Interpolation),
             ("solver", Solver),
             ("order", Literal[1, 2]),
+            ("defocus", Defocus),
         ):
             value = getattr(self, name)
             if value not in get_args(kind):
                 raise ValueError(f"{name} {value!r} must be one of {', '.join(map(repr, get_args(kind)))}")
+        method = self.object_aberration
+        if method is not None and method not in get_args(AberrationMethod):
+            raise ValueError(f"object_aberration {method!r} must be one of 'linear', 'cone'")
+        if method is not None and self.propagation == "wave":
+            raise ValueError(
+                f'object_aberration {method!r} has no use in propagation "wave", whose field has it already'
+            )
+        if method is not None and self.propagation == "rays" and self.amplitude:
+            raise ValueError(
+                f"object_aberration {method!r} double-counts what the rays' amplitude does: amplitude must be false"
+            )
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps} must be at least 1")
         if self.sources < 1:

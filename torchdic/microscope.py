@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdic.camera import Camera
 from torchdic.condenser import Condenser, Spectrum
-from torchdic.fidelity import STANDARD, Fidelity
+from torchdic.fidelity import STANDARD, Defocus, Fidelity
 from torchdic.grid import Grid
 from torchdic.jones import Polarisation
 from torchdic.landing import ray_field
@@ -21,8 +21,17 @@ from torchdic.prism import Prism
 from torchdic.projection import kept_by_projection, project
 from torchdic.rays import kept_by_rays
 from torchdic.recompute import sum_over_sources
+from torchdic.space_variant import Levels, object_levels
 from torchdic.volume import Volume
-from torchdic.wave import axial_difference, exp_i, kept_by_wave, split_step, to_field, to_spectrum
+from torchdic.wave import (
+    axial_difference,
+    exp_i,
+    kept_by_wave,
+    paraxial_difference,
+    split_step,
+    to_field,
+    to_spectrum,
+)
 
 KEPT = {"projection": kept_by_projection, "rays": kept_by_rays, "wave": kept_by_wave}
 
@@ -136,23 +145,54 @@ def _image(
     elif plane is None:
         plane = volume.mean_plane()
 
+    levels = None
+    if fidelity.object_aberration is not None:
+        parts = microscope.wavelength, microscope.objective, microscope.condenser
+        levels = object_levels(volume, plane, *parts, momentum, fidelity)
+
     def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
-        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity)
-        return form_image(spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition)
+        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity, levels)
+        return form_image(
+            spectrum,
+            volume.grid,
+            volume.background,
+            plane,
+            momentum,
+            weights,
+            microscope,
+            acquisition,
+            fidelity.defocus,
+        )
 
     kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition)
+    kept += 0 if levels is None else levels.kept
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
     return _seen(total, volume.grid, pad, microscope.camera)
 
 
 def propagate(
-    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
+    volume: Volume,
+    wavelength: float,
+    momentum: Float[Tensor, "source 2"],
+    plane: float,
+    fidelity: Fidelity,
+    levels: Levels | None = None,
 ) -> Complex[Tensor, "source y x"]:
-    """Spectrum of each source's envelope behind the specimen, referred to depth `plane` (the last face for a wave)."""
+    """Spectrum of each source's envelope behind the specimen, referred to depth `plane` (the last face for a wave).
+
+    levels: of the defocus with which each point of a field that rays make spreads.
+    """
     if fidelity.propagation == "wave":
         return split_step(volume, wavelength, momentum, fidelity)
     field = project if fidelity.propagation == "projection" else ray_field
-    return to_spectrum(field(volume, wavelength, momentum, plane, fidelity))
+    at_plane = field(volume, wavelength, momentum, plane, fidelity)
+    if levels is None:
+        return to_spectrum(at_plane)
+    if fidelity.defocus == "paraxial":
+        difference = paraxial_difference(volume.grid, wavelength, volume.background, momentum)
+    else:
+        difference, _ = axial_difference(volume.grid, wavelength, volume.background, momentum)
+    return levels.spread(at_plane, wavelength, difference)
 
 
 def image_field(
@@ -191,7 +231,7 @@ def image_field(
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-        return form_image(spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition)
+        return form_image(spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition, fidelity.defocus)
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
     kept = _kept_by_imaging(microscope, acquisition)
@@ -208,6 +248,7 @@ def form_image(
     weights: Float[Tensor, " source"],
     microscope: Microscope,
     acquisition: Acquisition,
+    defocus: Defocus = "exact",
 ) -> Float[Tensor, "prism focus y x"]:
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
 
@@ -218,6 +259,8 @@ def form_image(
     frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
     difference, pz = axial_difference(grid, microscope.wavelength, background, momentum)
     passes = pz > 0
+    if defocus == "paraxial":
+        difference = paraxial_difference(grid, microscope.wavelength, background, momentum)
     if microscope.objective is not None:
         waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
         passes = passes & microscope.objective.aperture(waves)

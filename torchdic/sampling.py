@@ -141,8 +141,8 @@ def _bspline(t: float) -> tuple[float, float, float, float]:
 
 def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """A spline and its derivatives at fractional indices."""
-    rows, wy, sy = _spline_taps(iy, coefficients.shape[0])
-    columns, wx, sx = _spline_taps(ix, coefficients.shape[1])
+    rows, wy, sy = spline_taps(iy, coefficients.shape[0])
+    columns, wx, sx = spline_taps(ix, coefficients.shape[1])
     flat = rows[..., :, None] * coefficients.shape[1] + columns[..., None, :]
     patch = coefficients.reshape(-1)[flat]
     along_x = (patch * wx[..., None, :]).sum(-1)
@@ -150,7 +150,7 @@ def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor,
     return (along_x * wy).sum(-1), (along_x * sy).sum(-1), slope_x
 
 
-def _spline_taps(index: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+def spline_taps(index: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """The four neighbours of a fractional index along an axis of n, with their weights and slopes."""
     # clamp's gradient is 0 outside, and so is the mirrored spline's slope at its ends
     along = index.clamp(0, n - 1)

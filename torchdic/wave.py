@@ -38,6 +38,14 @@ def axial_difference(
     return -(deflection * (deflection + 2 * p0)).sum(1) / (pz + pz0), pz
 
 
+def paraxial_difference(
+    grid: Grid, wavelength: float, background: Tensor, momentum: Float[Tensor, "source 2"]
+) -> Float[Tensor, "source y x"]:
+    """−(|p|² − |p0|²)/(2n0), p_z − p_z0 to second order in the momenta p at f + f_s."""
+    deflection = wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    return -(deflection * (deflection + 2 * momentum[:, :, None, None])).sum(1) / (2 * background)
+
+
 def exp_i(phase: Tensor) -> Tensor:
     """exp(i·phase) of a real phase, or of a complex one where light is absorbed."""
     return torch.exp(1j * phase) if phase.is_complex() else torch.polar(torch.ones_like(phase), phase)
