@@ -25,7 +25,7 @@ polar decomposition; B. Richards and E. Wolf, Proc. R. Soc. A 253, 358 (1959) fo
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,7 +34,7 @@ from torch import Tensor
 
 from torchdic.objective import zernike
 
-PauliZernike = Mapping[int, tuple[float | Tensor, float | Tensor]]
+PauliZernike = Mapping[int, Sequence[float | Tensor]]
 
 
 @dataclass(frozen=True, eq=False)
