@@ -137,6 +137,11 @@ class Polarisation:
         """Whether the pupil mixes the beams' polarisations, so that they are no scalar pair."""
         return self.pupil is not None and not self.pupil.ideal
 
+    @property
+    def states(self) -> int:
+        """Pure states of polariser and analyser, one each or two where it leaks, that add up to a DIC image."""
+        return (1 if self.polariser_extinction is None else 2) * (1 if self.analyser_extinction is None else 2)
+
     def form(self, bias: float | Tensor) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Complex[Tensor, ""]]:
         """The intensity's quadratic form (a, b, c) in the fields S and C behind sinϑ and cosϑ, on the CPU.
 

@@ -25,6 +25,8 @@ from torchdic.recompute import sum_over_sources
 from torchdic.volume import Volume
 from torchdic.wave import axial_difference, exp_i, kept_by_wave, split_step, to_field, to_spectrum
 
+# Values per source and pixel that autograd keeps of a pupil of Jones matrices, all of whose terms are learned.
+KEPT_BY_MATRIX = 50
 KEPT = {"projection": kept_by_projection, "rays": kept_by_rays, "wave": kept_by_wave}
 
 
@@ -156,7 +158,8 @@ def _image(
         spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity, turned=microscope.turns)
         return form_image(spectrum, volume.grid, volume.background, plane, momentum, weights, microscope, acquisition)
 
-    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition)
+    components = 2 if microscope.turns and fidelity.propagation == "rays" else 1
+    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition, components)
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
     return _seen(total, volume.grid, pad, microscope.camera)
 
@@ -338,7 +341,16 @@ def _state_transfers(
     return transfers
 
 
-def _kept_by_imaging(microscope: Microscope, acquisition: Acquisition) -> int:
+def _kept_by_imaging(microscope: Microscope, acquisition: Acquisition, components: int = 1) -> int:
+    if microscope.vectorial:
+        assert microscope.polarisation is not None
+        states = sum(4 if prism is None else microscope.polarisation.states for prism in acquisition.prisms)
+        per_focus = 4 * components + 2 * states
+        return (
+            KEPT_BY_MATRIX
+            + (4 * states + 10 * len(acquisition.prisms)) * components
+            + per_focus * len(acquisition.focus)
+        )
     fields = 1 if microscope.polarisation is None or microscope.polarisation.ideal else 2
     per_source = 0 if microscope.condenser_prism else 2 * fields * len(acquisition.prisms)
     return len(acquisition.focus) * (2 + 2 * fields * len(acquisition.prisms)) + per_source
