@@ -368,6 +368,24 @@ def test_grating_depolarises_by_the_tilt_of_p():
     assert float(expected.max()) > 1e-7
 
 
+def test_light_turns_between_specimen_and_lens_before_it_meets_the_strain():
+    """The grating again, through a plate: the amplitude is w†·J·(1 + ε·cos(2πfx)·T)v."""
+    x = GRID.coordinates(2, dtype=F64)
+    order, contrast, psi = 3, 0.1, 0.25
+    wave = contrast * torch.cos(2 * math.pi * order * x / GRID.extent[2])
+    field = (1 + wave).expand(GRID.shape[1:]).to(torch.complex128)
+    pupil = JonesPupil({1: (0.7, 0.4)}, depolarisation=True)
+    scope = Microscope(0.546, Objective(1.2), polarisation=Polarisation(pupil=pupil))
+    found = image_field(field, GRID, scope, Acquisition([Prism((0.0, 0.0), 0.0, psi)]), background=N0)[0, 0]
+    cosine = math.sqrt(1 - (0.546 * order / GRID.extent[2] / N0) ** 2)
+    tilt = torch.diag(torch.tensor([cosine, 1.0], dtype=F64))
+    specimen = torch.eye(2, dtype=F64) + wave[:, None, None] * tilt
+    strain = jones.retarder(math.hypot(0.7, 0.4), math.atan2(0.4, 0.7) / 2)
+    through = jones.train(specimen, strain, jones.polariser(psi - math.pi / 4))
+    expected = jones.intensity(jones.apply(through, jones.linear(psi + math.pi / 4)))
+    close(found, expected.expand_as(found))
+
+
 # --- laws ----------------------------------------------------------------------------------------------------------
 
 EVERYTHING = JonesPupil(STRAIN, LOSSES, depolarisation=True)
@@ -584,6 +602,20 @@ def test_gradient_of_the_specimen_is_the_central_difference(point, propagation):
         lambda t: compute({**point, "delta": point["delta"] + t * direction}, propagation), scalar(0.0), step
     )
     assert abs(float(found)) > 1e-2
+
+
+def test_batches_change_no_image_and_no_gradient(point, propagation):
+    """Sources one by one and computed again, turned rays among them."""
+    delta = point["delta"].requires_grad_()
+    scope = replace(SCOPE, polarisation=Polarisation(**ERRORS, pupil=EVERYTHING))
+    found = []
+    for memory in (1, 1 << 30):
+        images = image(
+            Volume(SMALL, delta, N0), scope, Acquisition([PRISM, None], [0.3]), Fidelity(propagation, memory=memory)
+        )
+        found.append((images.detach(), *torch.autograd.grad(images.square().sum(), delta)))
+    close(found[0][0], found[1][0])
+    close(found[0][1], found[1][1], 1e-12)
 
 
 def test_float32_is_close_to_float64():

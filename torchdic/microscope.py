@@ -259,6 +259,8 @@ def form_image(
         if pupil is not None:
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
+    if not microscope.condenser_prism or microscope.vectorial:
+        frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
 
     def sharp(focus: float | Tensor) -> Tensor:
         depth = torch.as_tensor(focus, dtype=difference.dtype, device=difference.device)
@@ -273,7 +275,7 @@ def form_image(
                 field = to_field((transfer * wave).sum(1))
                 images.append(torch.einsum("tsyxc,s,t->yx", torch.view_as_real(field).square(), weights, shares))
     else:
-        images = _scalar_images(sharp, frequencies, momentum, weights, microscope, acquisition)
+        images = _scalar_images(sharp, frequencies, weights, microscope, acquisition)
     shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
     return torch.stack(images).reshape(shape).transpose(0, 1)
 
@@ -281,14 +283,11 @@ def form_image(
 def _scalar_images(
     sharp: Callable[[float | Tensor], Tensor],
     frequencies: Tensor,
-    momentum: Tensor,
     weights: Tensor,
     microscope: Microscope,
     acquisition: Acquisition,
 ) -> list[Tensor]:
     """The images of each focus and prism where lenses leave polarisation alone, so that the beams are a scalar pair."""
-    if not microscope.condenser_prism:
-        frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
     polarisation = microscope.polarisation
     if polarisation is not None and polarisation.ideal:
         polarisation = None
@@ -315,27 +314,28 @@ def _state_transfers(
     acquisition: Acquisition,
     turned: bool,
 ) -> list[tuple[Tensor, Tensor]]:
-    """For each prism the shares of the light's pure states and what multiplies the spectrum for each of them."""
+    """For each prism the shares of the light's pure states and what multiplies the spectrum for each of them.
+
+    frequencies: the field's f + f_s.
+    """
     polarisation, objective = microscope.polarisation, microscope.objective
     assert polarisation is not None
     assert polarisation.pupil is not None
-    direct = momentum[:, :, None, None]
     # what the aperture stops would overflow, far outside it, in the polynomials and what is made of them
-    waves = torch.where(passes[:, None], direct + microscope.wavelength * frequencies, 0)
+    waves = torch.where(passes[:, None], microscope.wavelength * frequencies, 0)
     matrix = None if objective is None else polarisation.pupil.lenses(waves / objective.na)
     if polarisation.pupil.depolarisation and not turned:
-        matrix = (
-            turn(waves, momentum, background) if matrix is None else product(matrix, turn(waves, momentum, background))
-        )
+        tilted = turn(waves, momentum, background)
+        matrix = tilted if matrix is None else product(matrix, tilted)
     if matrix is None:  # bent rays through plain lenses
         matrix = torch.eye(2, dtype=momentum.dtype, device=momentum.device)[None, :, :, None, None]
-    frequencies = frequencies + direct / microscope.wavelength
+    direct = momentum[:, :, None, None] / microscope.wavelength
     transfers = []
     for prism in acquisition.prisms:
         if prism is None:
             transfers.append(unpolarised(matrix, turned=turned))
             continue
-        tilt = prism.shear_phase(direct / microscope.wavelength)[:, 0, 0] if microscope.condenser_prism else None
+        tilt = prism.shear_phase(direct)[:, 0, 0] if microscope.condenser_prism else None
         half, axis = prism.shear_phase(frequencies), prism.polarised_along(momentum)
         transfers.append(polarisation.transfers(matrix, half, tilt, axis, prism.bias, turned=turned))
     return transfers
