@@ -191,8 +191,8 @@ class Polarisation:
         if tilt is not None:
             condenser = torch.polar(torch.ones_like(tilt), -tilt)
             one, two = one * condenser, two * condenser.conj()
-        light_ = torch.stack((cos * one - sin * two, sin * one + cos * two), -1)
-        x, y = _behind(pupil, light_, turned).unbind(3)
+        laboratory = torch.stack((cos * one - sin * two, sin * one + cos * two), -1)
+        x, y = _behind(pupil, laboratory, turned).unbind(3)
         prism = torch.polar(torch.ones_like(half), half + torch.as_tensor(bias, dtype=kind, device=device) / 2)
         beams = prism * (cos * x + sin * y), prism.conj() * (cos * y - sin * x)
         first, second = analysed.to(device, kind)[:, :, None, None, None, None, None].unbind(1)
