@@ -21,7 +21,7 @@ def start(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Position and momentum (2, ray) of each ray on the first face."""
     y, x = ((np.arange(n) - (n - 1) / 2) * VOXEL for n in shape[1:])
     position = np.stack(np.meshgrid(y, x, indexing="ij")).reshape(2, -1).astype(np.float32)
-    momentum = np.broadcast_to(np.float32(DIRECTION)[:, None], position.shape).copy()
+    momentum = np.repeat(np.array(DIRECTION, np.float32)[:, None], position.shape[1], 1)
     return position, momentum
 
 

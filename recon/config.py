@@ -23,7 +23,19 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.descend import Recipe
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Layer, Microscope, Objective, Polarisation, Prism, Spectrum
+from torchdic import (
+    Acquisition,
+    Condenser,
+    Fidelity,
+    Grid,
+    JonesPupil,
+    Layer,
+    Microscope,
+    Objective,
+    Polarisation,
+    Prism,
+    Spectrum,
+)
 from torchdic.microscope import check_apertures
 
 T = TypeVar("T")
@@ -56,10 +68,11 @@ class VolumeSection:
 
 @dataclass(frozen=True)
 class CompensatorSection:
-    """A prism whose bias de Sénarmont's polariser sets, see `Prism.senarmont`: shear (y, x) in µm, polariser in rad."""
+    """A prism whose bias de Sénarmont's polariser sets, see `Prism.senarmont`: shear (y, x) in µm, angles in rad."""
 
     shear: tuple[float, float]
     polariser: float
+    axis: float | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,7 @@ class WedgeSection:
     indices: tuple[float, float] | None = None
     offset: float = 0.0
     direction: tuple[float, float] = (0.0, 1.0)
+    axis: float | None = None
 
 
 @dataclass(frozen=True)
@@ -244,7 +258,7 @@ def _prism(value: Any, _: Any) -> Prism | None:
         raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
     if "polariser" in value:
         compensator = converter.structure(value, CompensatorSection)
-        return Prism.senarmont(compensator.shear, compensator.polariser)
+        return Prism.senarmont(compensator.shear, compensator.polariser, axis=compensator.axis)
     if "wedge" in value:
         given = vars(converter.structure(value, WedgeSection))
         return Prism.from_wedge(given["wedge"], **{key: v for key, v in given.items() if key != "wedge"})
@@ -272,6 +286,12 @@ def _tensor(value: Any, _: Any) -> Tensor:
         return torch.tensor(value, dtype=torch.float64)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{value!r} must be an array of numbers") from error
+
+
+def _pauli_zernike(value: Any, _: Any) -> dict[int, tuple[float, float]]:
+    if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
+        raise TypeError(f"{value!r} must be a table of Noll indices, each with a pair of numbers in rad")
+    return {int(key): _tuple(pair, tuple[float, float]) for key, pair in value.items()}
 
 
 def _aberrations(value: Any, _: Any) -> dict[int, float]:
@@ -341,10 +361,11 @@ converter.register_structure_hook_func(
 converter.register_structure_hook_func(_is_optional, _optional)
 converter.register_structure_hook_func(lambda kind: get_origin(kind) is dict, _free_table)
 _hooks: dict[type, dict[str, Callable[[Any, Any], Any]]] = {
-    Prism: {"shear": lambda value, _: _tuple(value, tuple[float, float]), "bias": _number},
+    Prism: {"shear": lambda value, _: _tuple(value, tuple[float, float]), "bias": _number, "axis": _number},
     Objective: {"aberrations": _aberrations},
     Layer: dict.fromkeys(("thickness", "index", "design_index"), _number),
-    Polarisation: {field.name: _number for field in dataclasses.fields(Polarisation)},
+    Polarisation: {field.name: _number for field in dataclasses.fields(Polarisation) if field.name != "pupil"},
+    JonesPupil: dict.fromkeys(("retardance", "diattenuation"), _pauli_zernike),
     Condenser: {"points": _tensor, "weights": _tensor},
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _sequence_of(_number)),
     Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},

@@ -62,6 +62,8 @@ def load_data(config: Config) -> Measured:
         raise ConfigError(
             "reconstruction.start: 'linear' needs a condenser prism, microscope.condenser_prism is false; use 'zero'"
         )
+    if config.microscope.vectorial and config.reconstruction.start == "linear":
+        raise ConfigError("reconstruction.start: 'linear' can't hold microscope.polarisation.pupil; use 'zero'")
     section = config.data
     measured = prepare(
         read_stack(section.path),

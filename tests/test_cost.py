@@ -14,6 +14,7 @@ from torchdic import (
     Condenser,
     Fidelity,
     Grid,
+    JonesPupil,
     Layer,
     Microscope,
     Objective,
@@ -23,6 +24,7 @@ from torchdic import (
     Volume,
     image,
     landing,
+    microscope,
 )
 from torchdic.recompute import TRANSIENT
 from torchdic.sampling import SliceSampler
@@ -227,6 +229,8 @@ ABSENT = {
     "equal-weights": ({"condenser": Condenser(0.4, POINTS, torch.ones(3, dtype=torch.float64))}, {}),
     "polarisation": ({"polarisation": None}, {}),
     "ideal-polarisation": ({"polarisation": Polarisation()}, {}),
+    "jones-pupil": ({"polarisation": Polarisation(pupil=None)}, {}),
+    "empty-jones-pupil": ({"polarisation": Polarisation(pupil=JonesPupil({}, {}, depolarisation=False))}, {}),
     "condenser-prism": ({"condenser_prism": True}, {}),
     "spectrum": ({"spectrum": None}, {}),
     "one-colour": ({"spectrum": Spectrum((0.546,))}, {}),
@@ -321,6 +325,53 @@ def test_paraxial_defocus_costs_no_transform(delta, counted, propagation):
     exact, paraxial = (taking(delta, propagation=propagation, defocus=d) for d in ("exact", "paraxial"))
     assert counted(exact) == counted(paraxial)
     assert float((exact() - paraxial()).abs().max()) > 1e-4
+
+
+STRAIN = {1: (0.0, 0.0), 6: (0.1, 0.0)}
+LEAKY = {"polariser_extinction": 0.0, "analyser_extinction": 0.0}
+# fields of each of 4 DIC images and each of 2 bright fields, and the kind of light that comes behind the specimen
+PUPILS = {
+    "strain": (Polarisation(pupil=JonesPupil(STRAIN)), 1, False),
+    "losses": (Polarisation(pupil=JonesPupil(diattenuation=STRAIN)), 1, False),
+    "analyser-error": (Polarisation(analyser_error=0.0, pupil=JonesPupil(STRAIN)), 1, False),
+    "one-leak": (Polarisation(analyser_extinction=0.0, pupil=JonesPupil(STRAIN)), 2, False),
+    "two-leaks": (Polarisation(**LEAKY, pupil=JonesPupil(STRAIN)), 4, False),
+    "turn": (Polarisation(pupil=JonesPupil(depolarisation=True)), 1, True),
+    "all": (Polarisation(**LEAKY, pupil=JonesPupil(STRAIN, STRAIN, depolarisation=True)), 4, True),
+}
+
+
+@pytest.mark.parametrize(("polarisation", "states", "turns"), PUPILS.values(), ids=PUPILS.keys())
+def test_pupil_of_matrices_takes_a_field_for_each_state_of_the_light(
+    delta, counted, monkeypatch, propagation, polarisation, states, turns
+):
+    """One for ideal polarisers, as without; up to 4 for leaky ones, and 4 for the bright field's unpolarised light.
+
+    They share their calls. Rays that carry their polarisation have two components to transform, and no further samples.
+    """
+    sizes = []
+    back, forth = torch.fft.ifft2, torch.fft.fft2
+    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(a.numel()) or back(a, **k))
+    monkeypatch.setattr(torch.fft, "fft2", lambda a, **k: sizes.append(a.numel()) or forth(a, **k))
+    plain, declared = (
+        taking(delta, scope, propagation=propagation) for scope in (SCOPE, replace(SCOPE, polarisation=polarisation))
+    )
+    cost = counted(plain)
+    fields, sizes[:] = sum(sizes), []
+    assert counted(declared) == cost
+    components = 1 if turns and propagation == "rays" else 0
+    more = 4 * (states - 1) + 2 * 3 + components
+    assert sum(sizes) - fields == more * len(POINTS) * ROWS * COLUMNS
+
+
+def test_matrices_are_made_once_for_all_prisms_and_focus_planes(delta, monkeypatch):
+    calls = Counter()
+    for owner, name in ((JonesPupil, "lenses"), (microscope, "turn")):
+        plain = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *a, plain=plain, name=name: calls.update([name]) or plain(*a))
+    pupil = JonesPupil(STRAIN, depolarisation=True)
+    taking(delta, replace(SCOPE, polarisation=Polarisation(pupil=pupil)))()
+    assert calls == {"lenses": 1, "turn": 1}
 
 
 def test_pupil_is_cut_only_by_an_objective(delta, counted, monkeypatch):

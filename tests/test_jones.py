@@ -401,7 +401,7 @@ def test_polarisation_loads_from_toml_and_is_dumped_again(tmp_path):
     assert not microscope.condenser_prism
     assert microscope.polarisation is not None
     declared = [getattr(microscope.polarisation, field.name) for field in fields(Polarisation)]
-    assert declared == [1e-3, None, 0.0, None]
+    assert declared == [1e-3, None, 0.0, None, None]
     path.write_text(dump(load(path)))
     again = load(path).microscope
     assert not again.condenser_prism

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import tomllib
+import warnings
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from xml.etree import ElementTree
@@ -584,6 +585,20 @@ def test_a_linear_start_without_a_condenser_prism_is_refused_in_one_line(other, 
     zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
     with pytest.warns(reconstruct.PoorFitWarning):  # two steps, and a stack from a microscope that has the prism
         reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
+
+
+def test_a_linear_start_behind_a_pupil_of_matrices_is_refused_in_one_line(other, tmp_path):
+    microscope = {"polarisation": {"pupil": {"depolarisation": True}}}
+    code, err = command("reconstruct", other({"microscope": microscope}), "--out", tmp_path / "out")
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "microscope.polarisation.pupil" in err
+    assert not (tmp_path / "out").exists()
+    zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", reconstruct.PoorFitWarning)  # two steps only
+        reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
+    assert (tmp_path / "out" / "volume.ome.tif").exists()
 
 
 def test_rays_that_turn_are_told_in_one_line(other, tmp_path):

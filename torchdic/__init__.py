@@ -14,6 +14,7 @@ from torchdic.condenser import Condenser, Spectrum
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
 from torchdic.jones import Polarisation
+from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.prism import Prism
@@ -29,6 +30,7 @@ __all__ = [
     "Condenser",
     "Fidelity",
     "Grid",
+    "JonesPupil",
     "Layer",
     "Microscope",
     "Objective",

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,8 @@ from torchdic.camera import Camera
 from torchdic.condenser import Condenser, Spectrum
 from torchdic.fidelity import STANDARD, Defocus, Fidelity
 from torchdic.grid import Grid
-from torchdic.jones import Polarisation
+from torchdic.jones import Polarisation, unpolarised
+from torchdic.jones_pupil import product, turn
 from torchdic.landing import ray_field
 from torchdic.objective import Objective
 from torchdic.prism import Prism
@@ -33,6 +34,8 @@ from torchdic.wave import (
     to_spectrum,
 )
 
+# Values per source and pixel that autograd keeps of a pupil of Jones matrices, all of whose terms are learned.
+KEPT_BY_MATRIX = 50
 KEPT = {"projection": kept_by_projection, "rays": kept_by_rays, "wave": kept_by_wave}
 
 
@@ -50,7 +53,8 @@ class Microscope:
     None is ideal crossed polarisers. condenser_prism: whether a second prism in front of the condenser makes up for
     each source's tilt, as in Nomarski's microscope; without it the beams of an oblique source differ by 2π f_s·s more,
     and a wide condenser washes the contrast out, by 2J1(a)/a with a = 2π|s|NA_c/λ.
-    Raises ValueError for a wavelength that isn't positive or lies outside the spectrum.
+    Raises ValueError for a wavelength that isn't positive or lies outside the spectrum, and for Zernike terms of the
+    polarisation's pupil without an objective.
     """
 
     wavelength: float
@@ -68,6 +72,20 @@ class Microscope:
             low, high = min(self.spectrum.wavelengths), max(self.spectrum.wavelengths)
             if not (low <= self.wavelength <= high):
                 raise ValueError(f"wavelength {self.wavelength} µm lies outside its spectrum, {low} to {high} µm")
+        pupil = None if self.polarisation is None else self.polarisation.pupil
+        if pupil is not None and pupil.strained and self.objective is None:
+            raise ValueError("polarisation pupil: Zernike terms need the radius of a pupil, and objective is None")
+
+    @property
+    def vectorial(self) -> bool:
+        """Whether lenses mix the beams' polarisations, so that they are no scalar pair."""
+        return self.polarisation is not None and self.polarisation.vectorial
+
+    @property
+    def turns(self) -> bool:
+        """Whether condenser and objective turn polarisation between pupil and specimen."""
+        pupil = None if self.polarisation is None else self.polarisation.pupil
+        return pupil is not None and pupil.depolarisation
 
     @property
     def reach(self) -> float:
@@ -151,7 +169,7 @@ def _image(
         levels = object_levels(volume, plane, *parts, momentum, fidelity)
 
     def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
-        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity, levels)
+        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity, levels, turned=microscope.turns)
         return form_image(
             spectrum,
             volume.grid,
@@ -164,8 +182,9 @@ def _image(
             fidelity.defocus,
         )
 
-    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition)
-    kept += 0 if levels is None else levels.kept
+    components = 2 if microscope.turns and fidelity.propagation == "rays" else 1
+    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + _kept_by_imaging(microscope, acquisition, components)
+    kept += 0 if levels is None else components * levels.kept
     total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
     return _seen(total, volume.grid, pad, microscope.camera)
 
@@ -177,22 +196,28 @@ def propagate(
     plane: float,
     fidelity: Fidelity,
     levels: Levels | None = None,
-) -> Complex[Tensor, "source y x"]:
+    *,
+    turned: bool = False,
+) -> Complex[Tensor, "source *component y x"]:
     """Spectrum of each source's envelope behind the specimen, referred to depth `plane` (the last face for a wave).
 
-    levels: of the defocus with which each point of a field that rays make spreads.
+    levels: of the defocus with which each point of a field that rays make spreads. turned: whether bent rays carry
+    their polarisation. Theirs is then (source, 2, y, x), the components along +x and +y of light that comes in along
+    +x; the other ways across the specimen stay scalar.
     """
     if fidelity.propagation == "wave":
         return split_step(volume, wavelength, momentum, fidelity)
-    field = project if fidelity.propagation == "projection" else ray_field
-    at_plane = field(volume, wavelength, momentum, plane, fidelity)
+    if fidelity.propagation == "projection":
+        field = project(volume, wavelength, momentum, plane, fidelity)
+    else:
+        field = ray_field(volume, wavelength, momentum, plane, fidelity, turned=turned)
     if levels is None:
-        return to_spectrum(at_plane)
+        return to_spectrum(field)
     if fidelity.defocus == "paraxial":
         difference = paraxial_difference(volume.grid, wavelength, volume.background, momentum)
     else:
         difference, _ = axial_difference(volume.grid, wavelength, volume.background, momentum)
-    return levels.spread(at_plane, wavelength, difference)
+    return levels.spread(field, wavelength, difference)
 
 
 def image_field(
@@ -240,7 +265,7 @@ def image_field(
 
 
 def form_image(
-    spectrum: Complex[Tensor, "source y x"],
+    spectrum: Complex[Tensor, "source *component y x"],
     grid: Grid,
     background: Tensor,
     plane: float,
@@ -253,7 +278,8 @@ def form_image(
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
 
     Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f if a condenser prism
-    makes up for the tilt.
+    makes up for the tilt. Behind a pupil of Jones matrices it is the sum over pure states of the light, each with a D
+    of its own, see `Polarisation.transfers`. spectrum: with the components of `propagate` where rays are turned.
     """
     k0 = 2 * math.pi / microscope.wavelength
     frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
@@ -261,6 +287,9 @@ def form_image(
     passes = pz > 0
     if defocus == "paraxial":
         difference = paraxial_difference(grid, microscope.wavelength, background, momentum)
+    turned = spectrum.ndim == 4
+    if turned:
+        spectrum = spectrum.movedim(1, 0)
     if microscope.objective is not None:
         waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
         passes = passes & microscope.objective.aperture(waves)
@@ -268,29 +297,98 @@ def form_image(
         if pupil is not None:
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
-    if not microscope.condenser_prism:
+    if not microscope.condenser_prism or microscope.vectorial:
         frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
+
+    def sharp(focus: float | Tensor) -> Tensor:
+        depth = torch.as_tensor(focus, dtype=difference.dtype, device=difference.device)
+        return spectrum * exp_i(k0 * (depth - plane) * difference)
+
+    if microscope.vectorial:
+        transfers = _state_transfers(frequencies, passes, momentum, background, microscope, acquisition, turned)
+        images = []
+        for focus in acquisition.focus:
+            wave = sharp(focus)
+            for shares, transfer in transfers:
+                field = to_field((transfer * wave).sum(1))
+                images.append(torch.einsum("tsyxc,s,t->yx", torch.view_as_real(field).square(), weights, shares))
+    else:
+        images = _scalar_images(sharp, frequencies, weights, microscope, acquisition)
+    shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
+    return torch.stack(images).reshape(shape).transpose(0, 1)
+
+
+def _scalar_images(
+    sharp: Callable[[float | Tensor], Tensor],
+    frequencies: Tensor,
+    weights: Tensor,
+    microscope: Microscope,
+    acquisition: Acquisition,
+) -> list[Tensor]:
+    """The images of each focus and prism where lenses leave polarisation alone, so that the beams are a scalar pair."""
     polarisation = microscope.polarisation
     if polarisation is not None and polarisation.ideal:
         polarisation = None
     transfers = [None if prism is None else prism.transfer(frequencies) for prism in acquisition.prisms]
     images = []
     for focus in acquisition.focus:
-        sharp = spectrum * exp_i(
-            k0 * (torch.as_tensor(focus, dtype=difference.dtype, device=difference.device) - plane) * difference
-        )
+        wave = sharp(focus)
         for prism, transfer in zip(acquisition.prisms, transfers, strict=True):
-            field = to_field(sharp if transfer is None else sharp * transfer)
+            field = to_field(wave if transfer is None else wave * transfer)
             if prism is None or polarisation is None:
                 images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))
             else:
-                stopped = to_field(sharp * prism.parallel(frequencies))
+                stopped = to_field(wave * prism.parallel(frequencies))
                 images.append(torch.einsum("syx,s->yx", polarisation.intensity(field, stopped, prism.bias), weights))
-    shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
-    return torch.stack(images).reshape(shape).transpose(0, 1)
+    return images
 
 
-def _kept_by_imaging(microscope: Microscope, acquisition: Acquisition) -> int:
+def _state_transfers(
+    frequencies: Tensor,
+    passes: Tensor,
+    momentum: Tensor,
+    background: Tensor,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    turned: bool,
+) -> list[tuple[Tensor, Tensor]]:
+    """For each prism the shares of the light's pure states and what multiplies the spectrum for each of them.
+
+    frequencies: the field's f + f_s.
+    """
+    polarisation, objective = microscope.polarisation, microscope.objective
+    assert polarisation is not None
+    assert polarisation.pupil is not None
+    # what the aperture stops would overflow, far outside it, in the polynomials and what is made of them
+    waves = torch.where(passes[:, None], microscope.wavelength * frequencies, 0)
+    matrix = None if objective is None else polarisation.pupil.lenses(waves / objective.na)
+    if polarisation.pupil.depolarisation and not turned:
+        tilted = turn(waves, momentum, background)
+        matrix = tilted if matrix is None else product(matrix, tilted)
+    if matrix is None:  # bent rays through plain lenses
+        matrix = torch.eye(2, dtype=momentum.dtype, device=momentum.device)[None, :, :, None, None]
+    direct = momentum[:, :, None, None] / microscope.wavelength
+    transfers = []
+    for prism in acquisition.prisms:
+        if prism is None:
+            transfers.append(unpolarised(matrix, turned=turned))
+            continue
+        tilt = prism.shear_phase(direct)[:, 0, 0] if microscope.condenser_prism else None
+        half, axis = prism.shear_phase(frequencies), prism.polarised_along(momentum)
+        transfers.append(polarisation.transfers(matrix, half, tilt, axis, prism.bias, turned=turned))
+    return transfers
+
+
+def _kept_by_imaging(microscope: Microscope, acquisition: Acquisition, components: int = 1) -> int:
+    if microscope.vectorial:
+        assert microscope.polarisation is not None
+        states = sum(4 if prism is None else microscope.polarisation.states for prism in acquisition.prisms)
+        per_focus = 4 * components + 2 * states
+        return (
+            KEPT_BY_MATRIX
+            + (4 * states + 10 * len(acquisition.prisms)) * components
+            + per_focus * len(acquisition.focus)
+        )
     fields = 1 if microscope.polarisation is None or microscope.polarisation.ideal else 2
     per_source = 0 if microscope.condenser_prism else 2 * fields * len(acquisition.prisms)
     return len(acquisition.focus) * (2 + 2 * fields * len(acquisition.prisms)) + per_source

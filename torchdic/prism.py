@@ -28,30 +28,40 @@ class Prism:
 
     shear: full displacement (y, x) in µm between the two beams. bias: phase in rad by which beam 1, which is displaced
     by −shear/2 (so that it sees U(x + shear/2)), leads. Numbers or tensors; tensors are learned.
+    axis: rad from +x towards +y, along which beam 1 is polarised, beam 2 across it; None is the direction of the shear
+    (of a shear of exactly 0, +x). It matters where lenses tell polarisations apart, see `torchdic.jones_pupil`.
     Raises ValueError where a value is not finite or the shear isn't a pair.
     """
 
     shear: tuple[float | Tensor, float | Tensor] | Float[Tensor, " 2"]
     bias: float | Tensor
+    axis: float | Tensor | None = None
 
     def __post_init__(self) -> None:
         if len(self.shear) != 2:
             raise ValueError(f"shear has {len(self.shear)} components: it must be (y, x) in µm")
-        for name, value in (("shear y", self.shear[0]), ("shear x", self.shear[1]), ("bias", self.bias)):
+        named = {"shear y": self.shear[0], "shear x": self.shear[1], "bias": self.bias, "axis": self.axis}
+        for name, value in named.items():
+            if value is None:
+                continue
             number = float(torch.as_tensor(value, dtype=torch.float64).detach())
             if not math.isfinite(number):
                 raise ValueError(f"{name} {number} must be a finite number")
 
     @classmethod
     def senarmont(
-        cls, shear: tuple[float | Tensor, float | Tensor] | Float[Tensor, " 2"], polariser: float | Tensor
+        cls,
+        shear: tuple[float | Tensor, float | Tensor] | Float[Tensor, " 2"],
+        polariser: float | Tensor,
+        *,
+        axis: float | Tensor | None = None,
     ) -> "Prism":
         """A prism at its centre behind de Sénarmont's compensator: the bias is twice the polariser's angle.
 
         polariser: rad by which the polariser is turned from 45° to the prism's axes, its crossed position, towards
         beam 2's axis, in front of a quarter-wave plate whose slow axis is at 45°.
         """
-        return cls(shear, 2 * polariser)
+        return cls(shear, 2 * polariser, axis)
 
     @classmethod
     def from_wedge(
@@ -64,6 +74,7 @@ class Prism:
         indices: tuple[float | Tensor, float | Tensor] | None = None,
         offset: float | Tensor = 0.0,
         direction: tuple[float, float] = (0.0, 1.0),
+        axis: float | Tensor | None = None,
     ) -> "Prism":
         """The prism of two cemented wedges, see the module's docstring.
 
@@ -92,7 +103,7 @@ class Prism:
         slope = angle.tan() if isinstance(angle, Tensor) else math.tan(angle)
         shear = 2 * (extraordinary - ordinary) * slope * focal_length
         bias = -2 * math.pi * shear * offset / (wavelength * focal_length)
-        return cls((shear * (direction[0] / length), shear * (direction[1] / length)), bias)
+        return cls((shear * (direction[0] / length), shear * (direction[1] / length)), bias, axis)
 
     def transfer(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
         """sin(π f·s + bias/2): the two beams' interference behind a crossed analyser, but for a constant factor i.
@@ -106,7 +117,26 @@ class Prism:
         """cos(π f·s + bias/2): the two beams' interference behind a parallel analyser, what the crossed one stops."""
         return torch.cos(self._half_difference(frequencies))
 
+    def shear_phase(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
+        """π f·s, half the phase between the beams but for the bias."""
+        y, x = self._shear(frequencies)
+        return math.pi * (frequencies[..., 0, :, :] * y + frequencies[..., 1, :, :] * x)
+
+    def polarised_along(self, like: Tensor) -> Float[Tensor, " 2"]:
+        """(cos, sin) of the angle from +x towards +y along which beam 1 is polarised, in the dtype of `like`."""
+        if self.axis is not None:
+            axis = torch.as_tensor(self.axis, dtype=like.dtype, device=like.device)
+            return torch.stack((axis.cos(), axis.sin()))
+        y, x = self._shear(like)
+        squared = y.square() + x.square()
+        nowhere = squared == 0
+        length = torch.where(nowhere, 1, squared).sqrt()
+        return torch.stack((torch.where(nowhere, 1, x / length), torch.where(nowhere, 0, y / length)))
+
     def _half_difference(self, frequencies: Tensor) -> Tensor:
-        y, x = (torch.as_tensor(s, dtype=frequencies.dtype, device=frequencies.device) for s in self.shear)
         half_bias = torch.as_tensor(self.bias, dtype=frequencies.dtype, device=frequencies.device) / 2
-        return math.pi * (frequencies[..., 0, :, :] * y + frequencies[..., 1, :, :] * x) + half_bias
+        return self.shear_phase(frequencies) + half_bias
+
+    def _shear(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        y, x = (torch.as_tensor(s, dtype=like.dtype, device=like.device) for s in self.shear)
+        return y, x

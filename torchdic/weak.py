@@ -67,8 +67,8 @@ def transfer_function(
 
     The image of a weak specimen is background + Σ_z F⁻¹[T·F{Δn(z)}]; T is per unit of Δn, or of κ with `absorption`.
     prism: None is bright field. focus: z_f in µm. Of fidelity only `sources` and `steps` count. Differentiable in the
-    prism, the focus, the background and the aberrations. Raises ValueError as `image` does, and for a prism where the
-    microscope has no condenser prism: its factor then differs from source to source.
+    prism, the focus, the background and the aberrations. Raises ValueError as `image` does, for a pupil of Jones
+    matrices, and for a prism where the microscope has no condenser prism: its factor then differs between sources.
     """
     acquisition = Acquisition((prism,), (focus,))
     return transfer_functions(
@@ -160,6 +160,10 @@ def _kernel(
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
     check_apertures(microscope, float(background.detach()))
+    if microscope.vectorial:
+        raise ValueError(
+            "the linear transfer takes a prism's factor out of the sum over waves: it can't hold a polarisation pupil"
+        )
     if microscope.spectrum is not None:
         colours = [
             (share, *_kernel(grid, part, acquisition, background, fidelity, dtype, device))
