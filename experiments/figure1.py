@@ -87,7 +87,8 @@ def draw(modelled: Float[Tensor, "focus y x"], exact: Float[Tensor, "focus y x"]
         ax.set_xlabel("x (µm)")
     place = {"location": "bottom", "shrink": 0.8}
     figure.colorbar(axes[0, 0].images[0], ax=axes[:, :2], label="intensity over the empty bright field's", **place)
-    figure.colorbar(axes[0, 2].images[0], ax=axes[:, 2], label="difference", **place)
+    ticks = (-largest, 0.0, largest)
+    figure.colorbar(axes[0, 2].images[0], ax=axes[:, 2], label="difference", ticks=ticks, format="%.4f", **place)
     return figure
 
 
