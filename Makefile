@@ -27,6 +27,7 @@ lint: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/references.py
+	$(BIN)/python benchmarks/exact_fields.py
 
 clean:
 	rm -rf $(VENV) demo .pytest_cache .ruff_cache

@@ -8,15 +8,15 @@
   so the model is run on as many (`padding`).
 """
 
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from comparison import header, row, trial
 from data_synthetic import Bead, GaussianBall
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image_field
 
 DATA = Path(__file__).parents[1] / "tests" / "data"
 PADDING = 64
@@ -27,12 +27,12 @@ def main() -> None:
     thin_object()
     ball = _read("exact_ball_dic")
     smooth = GaussianBall(float(ball["sigma"]), float(ball["delta_peak"]), float(ball["n_medium"]))
-    print("\nsmooth ball, σ 2 µm, Δn 0.03 in 1.36, 21 directions to NA 0.6 (float32)")
+    print("\nsmooth ball, σ 2 µm, Δn 0.03 in 1.36, 21 directions to NA 0.6 (float32)\n")
     solid(ball, smooth, 18.0, [("projection", 120), ("rays", 120), ("wave", 18), ("wave", 120)])
     sphere = _read("exact_sphere_dic")
     n0 = float(sphere["n_medium"])
     sharp = Bead(float(sphere["radius"]), float(sphere["n_sphere"]) - n0, n0)
-    print("\nsharp bead, 10 µm, Δn 0.03 in 1.56, 37 directions to NA 0.77 (float32)")
+    print("\nsharp bead, 10 µm, Δn 0.03 in 1.56, 37 directions to NA 0.77 (float32)\n")
     solid(sphere, sharp, 10.0, [("projection", 80), ("rays", 80), ("wave", 40), ("wave", 80), ("wave", 160)])
 
 
@@ -67,20 +67,13 @@ def solid(reference: dict, specimen: Bead | GaussianBall, depth: float, trials: 
     ]
     focus = [float(f) for f in reference["focus"]]
     dx = float(reference["spacing"])
-    print("propagation   slice/µm  " + "  ".join(f"z={f:+.0f} µm" for f in focus) + "   seconds")
+    print(header(("propagation", "slice"), focus))
     for propagation, slices in trials:
         grid = Grid((slices, exact.shape[2], exact.shape[3]), (depth / slices, dx, dx))
         volume = Volume(grid, specimen.delta(grid, dtype=torch.float32), specimen.background)
-        start = time.perf_counter()
-        with torch.no_grad():
-            images = image(volume, microscope, Acquisition(prisms, focus), Fidelity(propagation, padding=PADDING))
-        seconds = time.perf_counter() - start
-        row = "  ".join(f"{e:8.4f}" for e in _errors(images, exact))
-        print(f"{propagation:<14}{grid.spacing[0]:<10.4g}{row}   {seconds:7.1f}", flush=True)
-
-
-def _errors(images: Tensor, exact: Tensor) -> list[float]:
-    return ((images - exact).square().mean((2, 3)).sqrt() / exact.std((2, 3), correction=0)).amax(0).tolist()
+        fidelity = Fidelity(propagation, padding=PADDING)
+        errors, seconds = trial(volume, microscope, Acquisition(prisms, focus), fidelity, exact)
+        print(row((propagation, f"{grid.spacing[0]:.4g} µm"), errors, seconds), flush=True)
 
 
 def _microscope(reference: dict, points: Tensor) -> Microscope:

@@ -3,8 +3,8 @@
 Every specimen is a frozen dataclass in µm with its background index; `delta(grid)` gives Δn and
 `index(grid)` gives n = background + Δn on a grid, (z, y, x). Where an exact answer exists the specimen
 knows it: rays through a layered medium and a graded-index rod, the straight-ray OPD of a Gaussian ball,
-the OPD step of etched glass, and the exact wave fields of a bead and of a ball of any smooth radial index,
-so that data for a reconstruction need not come from the model that inverts it.
+the OPD step of glass etched in a step or a grating, and the exact wave fields of a bead and of a ball of any
+smooth radial index, so that data for a reconstruction need not come from the model that inverts it.
 """
 
 from data_synthetic.ball import GaussianBall
@@ -19,6 +19,7 @@ from data_synthetic.exact import (
     sphere_field,
     sphere_near_field,
 )
+from data_synthetic.grating import EtchedGlassGrating
 from data_synthetic.layered import LayeredMedium
 from data_synthetic.rod import GradedIndexRod
 from data_synthetic.specimen import ExactRays, Specimen
@@ -28,6 +29,7 @@ __all__ = [
     "Bead",
     "CellPhantom",
     "Ellipsoid",
+    "EtchedGlassGrating",
     "EtchedGlassStep",
     "ExactRays",
     "GaussianBall",

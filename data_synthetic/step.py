@@ -1,73 +1,20 @@
 """A step etched into glass, the paper's second manufactured specimen."""
 
-import math
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from data_synthetic.fill import covered_fraction, require_subpixels
-from data_synthetic.specimen import (
-    Specimen,
-    require_above_zero,
-    require_finite,
-    require_index,
-    require_vector,
-)
-from torchdic.grid import Grid
+from data_synthetic.etched import EtchedGlass
 
 
 @dataclass(frozen=True)
-class EtchedGlassStep(Specimen):
-    """Glass below a mounting medium, its surface higher by `height` on the side that `direction` points to.
+class EtchedGlassStep(EtchedGlass):
+    """Glass whose surface is higher by `height` on the side that `direction` points to; see `EtchedGlass`.
 
-    Light travels toward +z, from the glass into the medium. The background is the medium, because that is
-    where the light leaves to the objective; the glass is Δn = glass − background. height, and the
-    surface's mean z `surface`, in µm; direction: a transverse vector (y, x) of any length; the edge runs
-    through the point `offset` µm along it. edge: 0 is a vertical wall, above 0 a smooth one, z = surface
-    + (height/2)·tanh((u − offset)/edge) with u the coordinate along direction. Voxels are filled by their
-    covered volume, which places a vertical wall to 1/(2·subpixels) of a voxel. A negative height is a
-    step down. Raises ValueError for an index below 1, a direction of length 0 or a negative edge.
+    The edge runs through the point `offset` µm along the direction. A negative height is a step down.
     """
 
-    height: float
-    glass: float
-    background: float
-    direction: tuple[float, float] = (0.0, 1.0)
-    offset: float = 0.0
-    surface: float = 0.0
-    edge: float = 0.0
-    subpixels: int = 4
-
-    def __post_init__(self) -> None:
-        require_index("glass", self.glass)
-        require_index("background", self.background)
-        require_vector("direction", self.direction, "y, x")
-        for name in ("height", "offset", "surface", "edge"):
-            require_finite(name, getattr(self, name), "µm")
-        require_subpixels(self.subpixels)
-        if self.edge != 0:
-            require_above_zero("edge", self.edge, "µm")
-        require_above_zero("length of the direction", math.hypot(*self.direction), "(y, x)")
-
-    @property
-    def opd_step(self) -> float:
-        """How much the OPD of axial light rises across the edge along `direction`, in µm.
-
-        height·(glass − background): above 0 where the higher side has more of the denser glass.
-        """
-        return self.height * (self.glass - self.background)
-
-    def surface_height(self, y: Float[Tensor, "*point"], x: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-        """The z in µm of the glass surface at (y, x) in µm."""
-        uy, ux = (u / math.hypot(*self.direction) for u in self.direction)
-        u = uy * y + ux * x - self.offset
-        return self.surface + self.height / 2 * (torch.tanh(u / self.edge) if self.edge > 0 else torch.sign(u))
-
-    def _delta(self, grid: Grid) -> Float[Tensor, "z y x"]:
-        def surfaces(y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-            upper = self.surface_height(y, x)
-            return torch.full_like(upper, -grid.extent[0] / 2).minimum(upper), upper
-
-        return (self.glass - self.background) * covered_fraction(grid, surfaces, self.subpixels)
+    def from_wall(self, u: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+        """The coordinate along the direction itself."""
+        return u

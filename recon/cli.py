@@ -18,7 +18,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import torch
 from tqdm import tqdm
 
-from data_synthetic import Bead, CellPhantom, EtchedGlassStep, GaussianBall, GradedIndexRod, LayeredMedium
+from data_synthetic import (
+    Bead,
+    CellPhantom,
+    EtchedGlassGrating,
+    EtchedGlassStep,
+    GaussianBall,
+    GradedIndexRod,
+    LayeredMedium,
+)
 from recon import figures
 from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
@@ -46,6 +54,7 @@ SPECIMENS: dict[str, type] = {
     "bead": Bead,
     "cell": CellPhantom,
     "etched_glass": EtchedGlassStep,
+    "etched_grating": EtchedGlassGrating,
     "gaussian_ball": GaussianBall,
     "graded_index_rod": GradedIndexRod,
     "layered_medium": LayeredMedium,

@@ -318,6 +318,7 @@ def test_demo_checks_its_folder_before_it_begins(refused, tmp_path):
         {"kind": "bead", "radius": 0.6, "contrast": 0.03},
         {"kind": "gaussian_ball", "sigma": 0.4, "contrast": -0.02, "centre": [0, 0.1, 0.2]},
         {"kind": "etched_glass", "height": 0.3, "glass": 1.52},
+        {"kind": "etched_grating", "height": 0.3, "glass": 1.52, "period": 0.8, "duty": 0.4},
         {
             "kind": "cell",
             "cytoplasm": {"shape": {"semi_axes": [0.9, 1.2, 1.0]}, "contrast": 0.02},

@@ -353,6 +353,52 @@ def test_mirroring_everything_mirrors_the_image(propagation, smooth_field, axes)
     torch.testing.assert_close(other.flip([a + 1 for a in axes]), one, rtol=0, atol=tolerance)
 
 
+def turned(vectors, angle):
+    """Transverse vectors (…, 2), (y, x), turned from x towards y."""
+    y, x = vectors.unbind(-1)
+    return torch.stack((y * math.cos(angle) + x * math.sin(angle), x * math.cos(angle) - y * math.sin(angle)), -1)
+
+
+def at(images, grid, places):
+    """Images (…, y, x) at places (place, 2) in µm, by their Fourier series: exact for what the array holds."""
+    waves = [
+        torch.exp(2j * math.pi * (p - grid.centre(axis, 0))[:, None] * torch.fft.fftfreq(n, d, dtype=torch.float64))
+        for axis, p, n, d in zip((1, 2), places.unbind(-1), grid.shape[1:], grid.spacing[1:], strict=True)
+    ]
+    return torch.einsum("...yx,py,px->...p", torch.fft.fft2(images, norm="forward"), *waves).real
+
+
+def test_turning_everything_by_30_degrees_turns_the_image(propagation):
+    """Specimen, shear and sources turned together about the optical axis, by an angle that the voxels don't share.
+
+    The smooth specimen is written down anew on the same voxels, and the image read at the turned places. What is left
+    is of the voxels and of the square array.
+    """
+    grid = Grid((10, 64, 64), (0.5, 0.16, 0.16))
+    angle, shear = math.radians(30), torch.tensor([0.05, 0.22], dtype=torch.float64)
+    z, y, x = torch.meshgrid(*(grid.coordinates(a, dtype=torch.float64) for a in range(3)), indexing="ij")
+
+    def images(specimen_angle, shear_angle):
+        v, u = turned(torch.stack((y, x), -1), -specimen_angle).unbind(-1)
+        delta = 0.02 * torch.exp(-(z**2) / 1.3 - (v - 0.3) ** 2 / 0.9 - (u + 0.2) ** 2 / 2.2)
+        scope = partially_coherent(turned(POINTS, specimen_angle))
+        acquisition = Acquisition([Prism(turned(shear, shear_angle), 0.9)], [0.8])
+        return image(Volume(grid, delta, N0), scope, acquisition, Fidelity(propagation, interpolation="cubic"))[0, 0]
+
+    places = torch.stack((y[0], x[0]), -1).flatten(0, 1)
+    places = places[places.norm(dim=-1) < 3]
+    straight = at(images(0.0, 0.0), grid, places)
+    contrast = float(straight.std())
+    error = {
+        shear_angle: float(
+            (at(images(angle, shear_angle), grid, turned(places, angle)) - straight).square().mean().sqrt()
+        )
+        for shear_angle in (angle, 0.0, -angle)
+    }
+    assert error[angle] < 0.002 * contrast, error[angle] / contrast
+    assert min(error[0.0], error[-angle]) > 0.2 * contrast
+
+
 @pytest.mark.parametrize("shift", [(3, 0), (0, -4), (2, 5)])
 def test_shifting_the_specimen_by_whole_pixels_shifts_the_image(propagation, shift):
     """Where the specimen is away from the sides; for the wave, periodic in the array, across them too."""

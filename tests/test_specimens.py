@@ -11,6 +11,7 @@ from data_synthetic import (
     Bead,
     CellPhantom,
     Ellipsoid,
+    EtchedGlassGrating,
     EtchedGlassStep,
     GaussianBall,
     GradedIndexRod,
@@ -27,6 +28,7 @@ SPECIMENS = [
     GaussianBall(1.0, 0.03, 1.36, (0.4, 1.0, -2.0)),
     CellPhantom(),
     EtchedGlassStep(1.3, 1.46, 1.40, (0.6, 0.8), 0.4, 0.2),
+    EtchedGlassGrating(1.3, 1.46, 1.40, (0.6, 0.8), 0.4, 0.2, period=3.1, duty=0.4),
 ]
 
 
@@ -167,6 +169,51 @@ def test_etched_step_is_anti_aliased_at_its_wall():
     assert (opd - opd[0]) / step.opd_step == pytest.approx([0, 0, 0, 0.75, 1, 1], abs=1e-12)
 
 
+@pytest.mark.parametrize("duty", [0.25, 0.5, 0.8])
+@pytest.mark.parametrize("direction", [(0.0, 1.0), (1.0, 0.0)])
+def test_grating_fills_its_exact_share_and_has_its_mean_index(duty, direction):
+    """Over whole periods the mean surface is surface + height·(duty − ½); walls on voxel faces, so exactly."""
+    grid = Grid((9, 40, 40), (0.3, 0.2, 0.2))
+    grating = EtchedGlassGrating(0.7, 1.46, 1.40, direction, 1.0, 0.13, period=4.0, duty=duty)
+    level = 0.13 + 0.7 * (duty - 0.5)
+    expected = 0.06 * (level + grid.extent[0] / 2) / grid.extent[0]
+    assert float(grating.delta(grid).mean()) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("edge", [0.0, 0.05])
+@pytest.mark.parametrize("direction", [(0.0, 1.0), (0.0, -2.0), (1.0, 0.0), (0.6, 0.8)])
+def test_grating_is_a_step_up_and_a_step_down_in_each_period_along_its_direction(direction, edge):
+    period, duty = 3.0, 0.4
+    grating = EtchedGlassGrating(1.3, 1.46, 1.40, direction, 0.4, 0.13, edge, period=period, duty=duty)
+    unit = torch.tensor(direction, dtype=torch.float64) / math.hypot(*direction)
+    y, x = (GRID.coordinates(axis, dtype=torch.float64) for axis in (1, 2))
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    u = torch.remainder(unit[0] * y + unit[1] * x - 0.4, period)
+    opd = grating.delta(GRID).sum(0) * GRID.spacing[0]
+    # a voxel's diagonal or six edge widths from any wall, where tanh is within 1e-5 of its end
+    inside = (u > 0.3) & (u < duty * period - 0.3)
+    outside = (u > duty * period + 0.3) & (u < period - 0.3)
+    low = 0.06 * (GRID.extent[0] / 2 + 0.13 - 0.65)
+    assert min(int(inside.sum()), int(outside.sum())) > 500
+    assert opd[outside] == pytest.approx(np.full(int(outside.sum()), low), rel=3e-5)
+    assert opd[inside] == pytest.approx(np.full(int(inside.sum()), low + grating.opd_step), rel=3e-5)
+    # a period further along the direction it is the same, half a period further it isn't; off the walls by a little
+    y, x = y + 0.013, x + 0.017
+    for share, same in ((1.0, True), (0.5, False)):
+        away = grating.surface_height(y + share * period * unit[0], x + share * period * unit[1])
+        assert torch.allclose(away, grating.surface_height(y, x), rtol=0, atol=1e-9) == same
+
+
+def test_grating_s_first_ridge_is_the_step():
+    step, grating = (
+        EtchedGlassStep(0.6, 1.5, 1.4, offset=0.05),
+        EtchedGlassGrating(0.6, 1.5, 1.4, offset=0.05, period=9),
+    )
+    near = Grid((4, 3, 20), (0.5, 0.2, 0.2))  # within half a ridge of the wall
+    assert torch.equal(step.delta(near), grating.delta(near))
+    assert step.opd_step == grating.opd_step
+
+
 def test_layer_has_its_indices():
     layer = LayeredMedium(0.1, 1.4, bottom=-2.0, thickness=4.0, edge=0.2)
     z = torch.tensor([-20.0, -2.0, 0.0, 2.0, 20.0], dtype=torch.float64)
@@ -300,6 +347,9 @@ BODY = Organelle(Ellipsoid((0.5, 0.5, 0.5), (0.0, 0.0, 0.0)), 0.03)
         (lambda: EtchedGlassStep(1.0, 0.9, 1.4), "index 0.9 of the glass"),
         (lambda: EtchedGlassStep(1.0, 1.5, 1.4, (0.0, 0.0)), "length of the direction 0.0"),
         (lambda: EtchedGlassStep(1.0, 1.5, 1.4, edge=-0.1), "edge -0.1 µm must be above 0"),
+        (lambda: EtchedGlassGrating(1.0, 1.5, 1.4, period=0.0), "period 0.0 µm must be above 0"),
+        (lambda: EtchedGlassGrating(1.0, 1.5, 1.4, period=2.0, duty=1.0), "duty 1.0 must lie between 0 and 1"),
+        (lambda: EtchedGlassGrating(1.0, 0.9, 1.4, period=2.0), "index 0.9 of the glass"),
         (lambda: EtchedGlassStep(math.inf, 1.5, 1.4), "height inf µm must be finite"),
         (lambda: CellPhantom(nucleus=None), "2 nucleoli lie in a nucleus, but the nucleus is None"),
         (lambda: CellPhantom(lipid=BODY), "lipid and nucleus overlap"),
