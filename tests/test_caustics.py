@@ -99,7 +99,7 @@ def test_beam_in_a_graded_index_slab_has_the_waves_phase(length):
     assert cmath.phase(complex(rays) / complex(waves)) == pytest.approx(0, abs=0.6 * beta)
 
 
-def lens(slices, behind=0, contrast=0.11, n=40):
+def lens(slices, behind=0, contrast=0.11, n=28):
     """A strong ball in the middle of the first slices, which focuses some 4 µm behind it, and empty ones; its depth."""
     grid = Grid((slices + behind, n, n - 3), (0.25, 0.18, 0.19))
     centre = -behind * 0.25 / 2
@@ -112,7 +112,7 @@ def lens(slices, behind=0, contrast=0.11, n=40):
 @pytest.mark.parametrize("momentum", [(0.0, 0.0), (0.35, -0.2)], ids=["axial", "oblique"])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-9}],
+    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-7}],
     ids=["linear", "cubic", "recomputed", "adaptive"],
 )
 def test_empty_slices_behind_do_not_show(momentum, options):
@@ -124,15 +124,16 @@ def test_empty_slices_behind_do_not_show(momentum, options):
     # where the ball's rim is weaker, the focus lies farther, and one caustic before the other
     assert {0.0, 1.0, 2.0} <= set(count.flatten().tolist())
     near, far = (ray_field(v, 0.3, source, z + 0.25, fidelity) for v, z in ((short, plane), (long, other)))
-    torch.testing.assert_close(far, near, rtol=0, atol=1e-6)
+    # a spline's ringing falls by 2 − √3 a voxel, and the two volumes end at different ones
+    torch.testing.assert_close(far, near, rtol=0, atol=1e-5)
 
 
-def test_image_behind_a_fold_is_nearer_to_the_waves_with_its_caustics(monkeypatch):
+def test_image_of_a_ball_that_focuses_inside_the_volume_is_the_waves(monkeypatch):
     """The fields of axial and oblique sources through a strong ball whose focus lies inside the volume.
 
-    Rms of the image over its standard deviation. Some 0.3 are the diffraction at the caustics, which rays lack.
+    Rms of the image over its standard deviation: below 1 %, as for weak balls, and a picture of something else without.
     """
-    volume, centre = lens(26, behind=24, n=56)
+    volume, centre = lens(26, behind=24, n=48)
     points = torch.tensor([[0.0, 0.0], [0.35, -0.2], [-0.3, 0.4]], dtype=torch.float64)
     microscope = Microscope(0.546, Objective(0.9), Condenser(0.5, points))
     acquisition = Acquisition([Prism((0.0, 0.24), math.pi / 2)], [centre, centre + 1.0, centre + 2.0])
@@ -144,9 +145,8 @@ def test_image_behind_a_fold_is_nearer_to_the_waves_with_its_caustics(monkeypatc
     error = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
     monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
     without = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
-    print(error, without)
-    assert float(error.max()) < 0.45
-    assert bool((error < 0.75 * without).all())
+    assert float(error.max()) < 0.01
+    assert float(without.min()) > 0.5
 
 
 # --- sought only where one can be ------------------------------------------------------------------------------------
@@ -197,13 +197,13 @@ def test_no_fold_escapes_the_bound_and_it_is_not_much_too_wary(interpolation, mo
     def onset(happens):
         low, high = 0.0, 0.3
         assert happens(high)
-        for _ in range(8):
+        for _ in range(6):
             middle = (low + high) / 2
             low, high = (low, middle) if happens(middle) else (middle, high)
         return high
 
     wary, real = onset(followed), onset(folded)
-    assert real / 6 < wary < real
+    assert real / 4 < wary < real
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -259,10 +259,10 @@ def test_looking_changes_no_bit_where_nothing_folds(monkeypatch, smooth_field, d
 
 @pytest.mark.parametrize("options", [{}, {"memory": 1}], ids=["kept", "recomputed"])
 def test_gradient_behind_a_fold_is_the_central_difference(options):
-    volume, centre = lens(26, behind=24, n=16)
+    volume, centre = lens(26, behind=16, n=13)
     fidelity = Fidelity("rays", **options)
     assert tubes_that_may_fold(volume, AXIAL, fidelity) is not None
-    weights = torch.randn(1, 16, 13, dtype=torch.complex128)
+    weights = torch.randn(1, 13, 10, dtype=torch.complex128)
 
     def of(delta):
         return (weights * ray_field(Volume(volume.grid, delta, 1.36), 0.546, AXIAL, centre, fidelity)).real.sum()
