@@ -26,6 +26,14 @@ def graded(alpha_y, alpha_x, length, shape, spacing):
     return Volume(grid, (n2.sqrt() - N0).expand(grid.shape).contiguous(), N0)
 
 
+def apodised(volume, waist, wavelength):
+    """With a first slice that absorbs all but a Gaussian beam exp(−r²/waist²): the edges of the array do not show."""
+    y, x = (volume.grid.coordinates(axis, dtype=torch.float64) for axis in (1, 2))
+    absorption = torch.zeros_like(volume.delta)
+    absorption[0] = (y[:, None].square() + x.square()) / waist**2 * wavelength / (2 * math.pi * volume.grid.spacing[0])
+    return Volume(volume.grid, volume.delta, volume.background, absorption)
+
+
 def passed(volume, momentum=AXIAL, fidelity=CUBIC):
     tubes = tubes_that_may_fold(volume, momentum, fidelity)
     assert tubes is not None
@@ -59,7 +67,9 @@ def test_each_focus_of_a_graded_index_rod_is_counted(ratio, length, caustics, fi
     middle = count[0, count.shape[1] // 2 - 1 : count.shape[1] // 2 + 1, count.shape[2] // 2 - 1 : count.shape[2] // 2]
     assert torch.equal(middle, torch.full_like(middle, caustics))
 
-    field = ray_field(volume, 0.3, AXIAL, volume.grid.extent[0] / 2, fidelity)[0, rows // 2, 8]
+    # what an edge of the array sends to the axis is dark
+    bright = apodised(volume, 0.3, 0.3)
+    field = ray_field(bright, 0.3, AXIAL, volume.grid.extent[0] / 2, fidelity)[0, rows // 2, 8]
     # linear voxels: the slope of a parabola is exact between centres, and W on the axis is 0 but for δp of the corners
     turned = cmath.phase(complex(field) * 1j**caustics)
     assert turned == pytest.approx(0, abs=0.05)
@@ -67,47 +77,42 @@ def test_each_focus_of_a_graded_index_rod_is_counted(ratio, length, caustics, fi
     assert abs(complex(field)) == pytest.approx(abs(area) ** -0.5, rel=0.05)
 
 
-@pytest.mark.parametrize("length", [0.25, 0.8, 1.25, 1.75, 2.2])
+@pytest.mark.parametrize("length", [0.25, 0.75, 1.25, 1.75, 2.25])
 def test_beam_in_a_graded_index_slab_has_the_waves_phase(length):
     """A Gaussian beam, cut out by an absorbing first slice: on the axis (cos αz + iβ sin αz)^(−½), β = (mode/waist)².
 
     That is the ABCD law's answer for waves. Rays have it but for β, between foci.
     """
-    alpha, waist, wavelength, slices = 0.2, 1.3, 0.2, 240
+    alpha, waist, wavelength = 0.1, 1.8, 0.2
     extent = length * math.pi / alpha
-    volume = graded(0.0, alpha, extent, (slices, 1, 141), (0.05, 0.05))
-    x = volume.grid.coordinates(2, dtype=torch.float64)
-    k0, first = 2 * math.pi / wavelength, torch.zeros(slices, 1, 1, dtype=torch.float64)
-    first[0] = 1
-    absorption = first * (x / waist) ** 2 / (k0 * volume.grid.spacing[0])
-    volume = Volume(volume.grid, volume.delta, N0, absorption)
-
-    rays = ray_field(volume, wavelength, AXIAL, extent / 2, CUBIC)[0, 0, 70]
-    waves = to_field(split_step(volume, wavelength, AXIAL, Fidelity("wave")))[0, 0, 70]
+    volume = apodised(graded(0.0, alpha, extent, (400, 1, 91), (0.1, 0.1)), waist, wavelength)
+    rays = ray_field(volume, wavelength, AXIAL, extent / 2, Fidelity("rays", steps=50))[0, 0, 45]
+    waves = to_field(split_step(volume, wavelength, AXIAL, Fidelity("wave")))[0, 0, 45]
     beta = wavelength / (math.pi * N0 * alpha) / waist**2
     assert beta < 0.15
     angle = length * math.pi
     # continuous: arg(cos + iβ sin) makes a turn as the angle does
     gouy = angle + cmath.phase(complex(math.cos(angle), beta * math.sin(angle)) * cmath.exp(-1j * angle))
-    # paraxial: the next order of the beam's angles, (α·waist)²/8, over the length
-    assert cmath.phase(complex(waves) * cmath.exp(0.5j * gouy)) == pytest.approx(0, abs=0.15)
-    # far from a focus β sin αz / cos αz is how much of the quarter wave is still to come, or too much
-    assert cmath.phase(complex(rays) / complex(waves)) == pytest.approx(0, abs=0.15 + beta)
+    # what is not paraxial in the beam, (α·waist)⁴/8 of its path's phase
+    assert cmath.phase(complex(waves) * cmath.exp(0.5j * gouy)) == pytest.approx(0, abs=0.02)
+    # at a quarter of π from a focus β/2 of the quarter wave is still to come, or too much
+    assert cmath.phase(complex(rays) / complex(waves)) == pytest.approx(0, abs=0.6 * beta)
 
 
-def lens(slices, behind=0, contrast=0.11, n=40):
-    """A strong ball in the middle of the first slices, which focuses some 5 µm behind it, and empty ones; its depth."""
-    grid = Grid((slices + behind, n, n - 3), (0.25, 0.18, 0.2))
+def lens(slices, behind=0, contrast=0.11, n=28):
+    """A strong ball in the middle of the first slices, which focuses some 4 µm behind it, and empty ones; its depth."""
+    grid = Grid((slices + behind, n, n - 3), (0.25, 0.18, 0.19))
     centre = -behind * 0.25 / 2
-    ball = GaussianBall(1.0, contrast, 1.36, (centre, 0.12, -0.2)).delta(grid)
-    ball[slices:] = 0
+    ball = GaussianBall(0.8, contrast, 1.36, (centre, 0.12, -0.2)).delta(grid)
+    # splines and linear interpolation end within two slices
+    ball[slices - 2 :] = 0
     return Volume(grid, ball, 1.36), centre
 
 
 @pytest.mark.parametrize("momentum", [(0.0, 0.0), (0.35, -0.2)], ids=["axial", "oblique"])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-9}],
+    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-7}],
     ids=["linear", "cubic", "recomputed", "adaptive"],
 )
 def test_empty_slices_behind_do_not_show(momentum, options):
@@ -115,20 +120,20 @@ def test_empty_slices_behind_do_not_show(momentum, options):
     fidelity = Fidelity("rays", **options)
     source = torch.tensor([momentum], dtype=torch.float64)
     (short, plane), (long, other) = lens(26), lens(26, behind=40)
-    assert float(passed(short, source, fidelity).max()) == 0
     count = passed(long, source, fidelity)
     # where the ball's rim is weaker, the focus lies farther, and one caustic before the other
     assert {0.0, 1.0, 2.0} <= set(count.flatten().tolist())
     near, far = (ray_field(v, 0.3, source, z + 0.25, fidelity) for v, z in ((short, plane), (long, other)))
-    torch.testing.assert_close(far, near, rtol=0, atol=1e-6)
+    # a spline's ringing falls by 2 − √3 a voxel, and the two volumes end at different ones
+    torch.testing.assert_close(far, near, rtol=0, atol=1e-5)
 
 
-def test_image_behind_a_fold_is_nearer_to_the_waves_with_its_caustics(monkeypatch):
+def test_image_of_a_ball_that_focuses_inside_the_volume_is_the_waves(monkeypatch):
     """The fields of axial and oblique sources through a strong ball whose focus lies inside the volume.
 
-    Rms of the image over its standard deviation. Some 0.3 are the diffraction at the caustics, which rays lack.
+    Rms of the image over its standard deviation: below 1 %, as for weak balls, and a picture of something else without.
     """
-    volume, centre = lens(26, behind=24, n=56)
+    volume, centre = lens(26, behind=24, n=48)
     points = torch.tensor([[0.0, 0.0], [0.35, -0.2], [-0.3, 0.4]], dtype=torch.float64)
     microscope = Microscope(0.546, Objective(0.9), Condenser(0.5, points))
     acquisition = Acquisition([Prism((0.0, 0.24), math.pi / 2)], [centre, centre + 1.0, centre + 2.0])
@@ -140,9 +145,8 @@ def test_image_behind_a_fold_is_nearer_to_the_waves_with_its_caustics(monkeypatc
     error = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
     monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
     without = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
-    print(error, without)
-    assert float(error.max()) < 0.45
-    assert bool((error < 0.75 * without).all())
+    assert float(error.max()) < 0.01
+    assert float(without.min()) > 0.5
 
 
 # --- sought only where one can be ------------------------------------------------------------------------------------
@@ -159,7 +163,7 @@ def looks(monkeypatch):
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
 def test_smooth_ball_is_not_searched_and_a_strong_lens_is(looks, interpolation):
-    grid = Grid((36, 40, 40), (0.5, 0.3, 0.3))
+    grid = Grid((28, 40, 40), (0.5, 0.3, 0.3))
     momentum = torch.tensor([[0.0, 0.0], [0.5, -0.5]], dtype=torch.float64)
     fidelity = Fidelity("rays", interpolation=interpolation)
     ray_field(Volume(grid, GaussianBall(2.0, 0.03, 1.36).delta(grid), 1.36), 0.546, momentum, 0.0, fidelity)
@@ -185,7 +189,7 @@ def test_no_fold_escapes_the_bound_and_it_is_not_much_too_wary(interpolation, mo
 
         def watch(state):
             tubes(state)
-            least.append(float(tubes._tube.real.min()))
+            least.append(float(tubes._area.min()))
 
         deviation(volume, launch(volume.grid, source, volume.background, 0.0, MARGIN), fidelity, watch=watch)
         return min(least) <= 0
@@ -193,13 +197,13 @@ def test_no_fold_escapes_the_bound_and_it_is_not_much_too_wary(interpolation, mo
     def onset(happens):
         low, high = 0.0, 0.3
         assert happens(high)
-        for _ in range(8):
+        for _ in range(6):
             middle = (low + high) / 2
             low, high = (low, middle) if happens(middle) else (middle, high)
         return high
 
     wary, real = onset(followed), onset(folded)
-    assert real / 6 < wary < real
+    assert real / 4 < wary < real
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -218,9 +222,7 @@ def test_bound_holds_where_index_meets_the_sides(smooth_field, interpolation):
                 free += 1
                 tubes, areas = Tubes(grid, 1.0), []
                 start = launch(grid, source, volume.background, 0.0, MARGIN)
-                deviation(
-                    volume, start, fidelity, watch=lambda s, t=tubes, a=areas: (t(s), a.append(t._tube.real.min()))
-                )
+                deviation(volume, start, fidelity, watch=lambda s, t=tubes, a=areas: (t(s), a.append(t._area.min())))
                 assert float(torch.stack(areas).min()) > 0
     assert free > 10
 
@@ -249,19 +251,18 @@ def test_looking_changes_no_bit_where_nothing_folds(monkeypatch, smooth_field, d
     monkeypatch.setattr(landing, "tubes_that_may_fold", lambda volume, *_: Tubes(volume.grid, 1.0))
     found = of()
     assert torch.equal(found[0], plain[0])
-    torch.testing.assert_close(found[1], plain[1], rtol=0, atol=1e-3 * float(plain[1].abs().max()) * dtype_eps(dtype))
-
-
-def dtype_eps(dtype):
-    return 1e4 * torch.finfo(dtype).eps
+    # slabs' gradients are added up in another order
+    torch.testing.assert_close(
+        found[1], plain[1], rtol=0, atol=100 * torch.finfo(dtype).eps * float(plain[1].abs().max())
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"memory": 1}], ids=["kept", "recomputed"])
 def test_gradient_behind_a_fold_is_the_central_difference(options):
-    volume, centre = lens(26, behind=24, n=16)
+    volume, centre = lens(26, behind=16, n=13)
     fidelity = Fidelity("rays", **options)
     assert tubes_that_may_fold(volume, AXIAL, fidelity) is not None
-    weights = torch.randn(1, 16, 13, dtype=torch.complex128)
+    weights = torch.randn(1, 13, 10, dtype=torch.complex128)
 
     def of(delta):
         return (weights * ray_field(Volume(volume.grid, delta, 1.36), 0.546, AXIAL, centre, fidelity)).real.sum()
@@ -270,7 +271,7 @@ def test_gradient_behind_a_fold_is_the_central_difference(options):
     (gradient,) = torch.autograd.grad(of(value), value)
     direction = torch.randn_like(gradient).abs() * torch.where(gradient < 0, -1.0, 1.0)
     # so small a step that hardly any ray goes from one piece of the field or the mesh to the next
-    step = 1e-8
+    step = 1e-10
     at = [float(of(volume.delta + t * step * direction)) for t in (-2, -1, 1, 2)]
     expected = (8 * (at[2] - at[1]) - (at[3] - at[0])) / (12 * step)
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5)

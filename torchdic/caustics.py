@@ -11,6 +11,7 @@ lens, det Q does not change its sign. But det(Q + iηP), with any length η > 0,
 """
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -33,8 +34,9 @@ class Tubes:
 
     def __init__(self, grid: Grid, eta: float) -> None:
         self._spacing, self._eta = grid.spacing[1:], eta
-        # on the first face det Q = 1 and P = 0
-        self._tube, self._argument = torch.ones(()), torch.zeros(())
+        # on the first face Q = I and P = 0
+        self._area = self._tube = torch.ones(())
+        self._argument = torch.zeros(())
 
     @torch.no_grad()
     def __call__(self, state: Float[Tensor, "4 source y x"]) -> None:
@@ -42,17 +44,11 @@ class Tubes:
         # around the outermost rays lies a ring of cells whose rays deviate as those do
         state = F.pad(state, (1, 1, 1, 1), mode="replicate")
         y, x = torch.complex(state[:2], self._eta * state[2:])
-        dy, dx = self._spacing
         # edges from ray to ray along x and along y, each with its components (y, x)
-        along_x = y.diff(dim=2), dx + x.diff(dim=2)
-        along_y = dy + y.diff(dim=1), x.diff(dim=1)
-        tube = torch.stack(
-            [
-                along_x[1][:, side] * along_y[0][:, :, side] - along_x[0][:, side] * along_y[1][:, :, side]
-                for side in (slice(None, -1), slice(1, None))
-            ],
-            -1,
-        )
+        dy, dx = self._spacing
+        along_x, along_y = (y.diff(dim=2), dx + x.diff(dim=2)), (dy + y.diff(dim=1), x.diff(dim=1))
+        self._area = _areas([v.real for v in along_x], [v.real for v in along_y])
+        tube = _areas(along_x, along_y)
         self._argument = self._argument + (tube * self._tube.conj()).angle()
         self._tube = tube
 
@@ -61,7 +57,7 @@ class Tubes:
 
         The cells are those between the rays, and a ring around them.
         """
-        odd = (self._tube.real < 0).to(self._argument)
+        odd = (self._area < 0).to(self._argument)
         return odd + 2 * ((-self._argument / math.pi - odd) / 2).round()
 
 
@@ -69,9 +65,9 @@ class Tubes:
 def tubes_that_may_fold(volume: Volume, momentum: Float[Tensor, "source 2"], fidelity: Fidelity) -> Tubes | None:
     """Tubes to be followed through the volume, or None where there provably is no caustic in it.
 
-    S = PQ⁻¹ obeys S' = −H_xx − H_xp S − S H_px − S H_pp S, so |S| is at most the solution of s' = c + 2a s + b s², where
-    a, b, c bound |H_px|, |H_pp|, |H_xx| slice by slice. With s = p/q that is q' = −a q − b p, p' = c q + a p from q = 1,
-    p = 0, and while q > 0, S is finite and Q has an inverse: a thin lens is cleared up to its very focus.
+    S = PQ⁻¹ obeys S' = −H_xx − H_xp S − S H_px − S H_pp S. So |S| is at most the solution of s' = c + 2a s + b s² where
+    a, b, c bound |H_px|, |H_pp|, |H_xx| slice by slice. With s = p/q that is q' = −a q − b p, p' = c q + a p, from
+    q = 1, p = 0. While q > 0, S is finite and Q has an inverse: a thin lens is cleared up to its very focus.
     """
     grid, n0 = volume.grid, float(volume.background)
     field = spline_coefficients(volume.delta) if fidelity.interpolation == "cubic" else volume.delta
@@ -102,6 +98,14 @@ def tubes_that_may_fold(volume: Volume, momentum: Float[Tensor, "source 2"], fid
         if not float(pair[0]) > 0:
             return tubes
     return None
+
+
+def _areas(along_x: Sequence[Tensor], along_y: Sequence[Tensor]) -> Tensor:
+    """Twice the areas of both triangles of each cell, whose edges have the components (y, x)."""
+    near, far = slice(None, -1), slice(1, None)
+    return torch.stack(
+        [along_x[1][:, i] * along_y[0][:, :, i] - along_x[0][:, i] * along_y[1][:, :, i] for i in (near, far)], -1
+    )
 
 
 def _bounds(field: Float[Tensor, "y x"], grid: Grid) -> Float[Tensor, "4"]:
