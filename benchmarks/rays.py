@@ -21,8 +21,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import ray_rivals
 from scipy.ndimage import gaussian_filter
+
+import ray_rivals
 
 # Each way and what it imports.
 WAYS = {

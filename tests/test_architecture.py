@@ -134,7 +134,7 @@ def test_no_file_is_a_drawer_for_everything():
 def test_solver_and_viewer_stay_in_one_place():
     """torchdiffeq belongs to rays alone, and matplotlib to no physics."""
     users = {path.stem for path in modules("torchdic") if "torchdiffeq" in packages(path)}
-    assert users == {"rays"}
+    assert users == {"ray_solver"}
     assert not any("matplotlib" in packages(path) for path in modules("torchdic"))
 
 

@@ -143,7 +143,7 @@ def test_bending_and_amplitude_are_paid_by_those_who_ask_for_them(delta):
             {"propagation": "rays"},
         )
     )
-    assert straight < bent / 4
+    assert straight < bent / 3
     assert bent < whole
     bent, whole = (peak(taking(delta, propagation="rays", amplitude=amplitude)) for amplitude in (False, True))
     assert bent < whole
