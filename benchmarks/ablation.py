@@ -40,7 +40,7 @@ from torchdic import (
 )
 from torchdic.aberration import effective_defocus
 from torchdic.fidelity import AberrationMethod
-from torchdic.microscope import form_image
+from torchdic.imaging import form_image
 from torchdic.projection import project
 from torchdic.rays import Deviation, axial_momentum
 from torchdic.space_variant import levels

@@ -36,7 +36,7 @@ from torchdic import (
     Prism,
     Spectrum,
 )
-from torchdic.microscope import check_apertures
+from torchdic.instrument import check_apertures
 
 T = TypeVar("T")
 BRIGHT_FIELD = "brightfield"

@@ -33,6 +33,8 @@ LAYERS = (
     "prism",
     "space_variant",
     "camera",
+    "instrument",
+    "imaging",
     "microscope",
     "weak",
     "plan",

@@ -23,8 +23,8 @@ from torchdic import (
     Spectrum,
     Volume,
     image,
+    imaging,
     landing,
-    microscope,
 )
 from torchdic.recompute import TRANSIENT
 from torchdic.sampling import SliceSampler
@@ -366,7 +366,7 @@ def test_pupil_of_matrices_takes_a_field_for_each_state_of_the_light(
 
 def test_matrices_are_made_once_for_all_prisms_and_focus_planes(delta, monkeypatch):
     calls = Counter()
-    for owner, name in ((JonesPupil, "lenses"), (microscope, "turn")):
+    for owner, name in ((JonesPupil, "lenses"), (imaging, "turn")):
         plain = getattr(owner, name)
         monkeypatch.setattr(owner, name, lambda *a, plain=plain, name=name: calls.update([name]) or plain(*a))
     pupil = JonesPupil(STRAIN, depolarisation=True)

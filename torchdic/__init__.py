@@ -13,9 +13,10 @@ from torchdic.camera import Camera
 from torchdic.condenser import Condenser, Spectrum
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
+from torchdic.instrument import Acquisition, Microscope, SamplingWarning
 from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
-from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
+from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from torchdic.fidelity import STANDARD, Fidelity
 from torchdic.grid import Grid
-from torchdic.microscope import Acquisition, Microscope, check_apertures
+from torchdic.instrument import Acquisition, Microscope, check_apertures
 from torchdic.prism import Prism
 from torchdic.recompute import sum_over_sources
 from torchdic.volume import Volume
