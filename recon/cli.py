@@ -49,6 +49,7 @@ from torchdic import (
 )
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
+from torchdic.wave import UnstableError
 
 SPECIMENS: dict[str, type] = {
     "bead": Bead,
@@ -73,6 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave has no such limit", BAD_INPUT)
+    except UnstableError as error:
+        return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:

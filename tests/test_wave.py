@@ -8,7 +8,7 @@ import torch
 
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
-from torchdic.wave import axial_difference, slab_mean, split_step, to_field, to_spectrum
+from torchdic.wave import UnstableError, axial_difference, slab_mean, split_step, to_field, to_spectrum
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -183,3 +183,16 @@ def test_spectrum_and_field_are_inverse_and_a_constant_is_its_own_amplitude(dtyp
     constant = to_spectrum(torch.full((4, 5), 2.5, dtype=dtype))
     assert float(constant[0, 0].real) == pytest.approx(2.5)
     assert float(constant.abs().sum()) == pytest.approx(2.5)
+
+
+def test_slabs_that_make_energy_are_refused_and_thin_ones_are_not():
+    """A vertical step of 0.5, in light that runs along it and across: 0.15 µm slabs make a million times the energy."""
+    delta = torch.zeros(16, 48, 48, dtype=torch.float64)
+    delta[:, :, 24:] = 0.5
+    volume = Volume(Grid((16, 48, 48), (0.15, 0.15, 0.15)), delta, N0)
+    sources = momentum((0.0, 0.0), (0.6, 0.0))
+    with pytest.raises(
+        UnstableError, match=r"slabs of 0.15 µm are too thick for Δn from 0 to 0.5: .* more than 16 steps"
+    ):
+        split_step(volume, WAVELENGTH, sources, Fidelity())
+    assert bool(torch.isfinite(split_step(volume, WAVELENGTH, sources, Fidelity(steps=512)).abs()).all())

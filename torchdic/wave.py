@@ -17,9 +17,16 @@ from torchdic.rays import axial_momentum
 from torchdic.recompute import recompute, slabs
 from torchdic.volume import Volume
 
-# Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp beads
-# anything from 0.25 to 0.6 errs alike, 0.1 up to twice as much (benchmarks/exact_fields.py), and strong steps gain energy.
+# Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
+# beads floors from 0.25 to 0.6 err alike and 0.1 up to twice as much (benchmarks/exact_fields.py); the lower the floor,
+# the thinner the slabs that strong steps of the index want.
 LOWEST_PZ = 0.3
+# Energy up to which waves may grow, where none can be made: beyond it their growth is the slabs', not the specimen's.
+MOST_ENERGY = 1.1
+
+
+class UnstableError(ValueError):
+    """Slabs too thick for a specimen's contrast: one line with the energy they make and the steps that they have."""
 
 
 def axial_difference(
@@ -70,7 +77,8 @@ def split_step(
     The textbook's phase screen k0·Δn·dz is wrong for oblique light, because the effect of Δn depends on the angle after
     scattering as well as before: with B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen
     φ = k0 dz B/(√(n² − |p0|²) + p_z0), exact for a slab along the source, is followed by the factor
-    G² = p_z0/p_z(f + f_s) on what it scatters, to first or second order in φ.
+    G² = p_z0/p_z(f + f_s) on what it scatters, to first or second order in φ. Raises UnstableError where the slabs are
+    so thick that this makes energy.
     """
     steps = fidelity.steps or volume.grid.shape[0]
     dz = volume.grid.extent[0] / steps
@@ -117,7 +125,20 @@ def split_step(
     crowded = kept_by_wave(volume.grid, fidelity) * pz.numel() * pz.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
         S = recompute(cross, first, last, S, when=crowded)
+    _check_energy(S.detach(), pz, pz0, volume, steps)
     return S
+
+
+@torch.no_grad()
+def _check_energy(S: Tensor, pz: Tensor, pz0: Tensor, volume: Volume, steps: int) -> None:
+    """Σ p_z|S|² of each source, p_z0 in front of the specimen, grows where a slab scatters more than there is."""
+    most = float(((pz / pz0) * torch.view_as_real(S).square().sum(-1)).sum((1, 2)).max())
+    if not most <= MOST_ENERGY:
+        low, high = (float(v) for v in torch.aminmax(volume.delta))
+        raise UnstableError(
+            f"slabs of {volume.grid.extent[0] / steps:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind "
+            f"them the wave has {most:.3g} times the energy that came in; use more than {steps} steps"
+        )
 
 
 def kept_by_wave(grid: Grid, fidelity: Fidelity) -> int:
