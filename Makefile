@@ -16,7 +16,7 @@ demo: $(INSTALLED)
 
 # tests run side by side, each on one thread: a test's tensors are too small for more
 test test-all: export OMP_NUM_THREADS := 1
-PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
 test: $(INSTALLED)
 	$(PYTEST) -m "not slow"
