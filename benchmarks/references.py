@@ -40,7 +40,8 @@ def thin_object() -> None:
     print(header(("object", "image", "defocus"), focus))
     for specimen in ("gauss", "asym"):
         transmission = torch.from_numpy(data[f"object_{specimen}"])
-        grid = Grid((1, *transmission.shape), (1.0, float(data["spacing"]), float(data["spacing"])))
+        (ny, nx), dx = transmission.shape, float(data["spacing"])
+        grid = Grid((1, ny, nx), (1.0, dx, dx))
         for kind, prism in kinds.items():
             expected = torch.from_numpy(data[f"{kind}_{specimen}"])
             for defocus in ("paraxial", "exact"):
