@@ -3,8 +3,7 @@
     python benchmarks/ablation.py
 
 A row for the method and for the method with one part changed; the error is the rms difference from the exact image
-over that image's standard deviation, at each focus plane. The reference was made on a periodic array of 256 × 256
-pixels and cropped to 128, so the model is run on as many.
+over that image's standard deviation, at each focus plane. The model is run on the reference's periodic array.
 
 A second table is of the specimen's own defocus of each object point, Kagalwala & Kanade's Eq. 6, on the smooth ball and
 on the sharp bead of tests/data/exact_sphere_dic.npz, unpadded: what it gives to rays without amplitude, straight and
@@ -15,29 +14,16 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Literal
 from unittest import mock
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from data_synthetic import Bead, GaussianBall
-from torchdic import (
-    Acquisition,
-    Condenser,
-    Fidelity,
-    Grid,
-    Microscope,
-    Objective,
-    Prism,
-    Volume,
-    image,
-    image_field,
-    landing,
-)
+from comparison import header, row
+from stored import PADDING, Scene, sharp_bead, smooth_ball
+from torchdic import Fidelity, Grid, Volume, image, image_field, landing
 from torchdic.aberration import effective_defocus
 from torchdic.fidelity import AberrationMethod
 from torchdic.imaging import form_image
@@ -46,67 +32,7 @@ from torchdic.rays import Deviation, axial_momentum
 from torchdic.space_variant import levels
 from torchdic.wave import axial_difference, exp_i, slab_mean, to_field, to_spectrum
 
-DATA = Path(__file__).parents[1] / "tests" / "data"
-DEPTH = 18.0
-PADDING = 64
-
 Name = Literal["rays", "no p_z", "no amplitude", "at the exit", "textbook screen", "split step"]
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """The exact images (prism, focus, y, x), what they show, and how they were taken."""
-
-    images: Tensor
-    specimen: GaussianBall | Bead
-    depth: float
-    spacing: float
-    microscope: Microscope
-    acquisition: Acquisition
-
-    def volume(self, slices: int) -> Volume:
-        """The specimen in float32 on `slices` slices of its depth."""
-        ny, nx = self.images.shape[2:]
-        grid = Grid((slices, ny, nx), (self.depth / slices, self.spacing, self.spacing))
-        return Volume(grid, self.specimen.delta(grid, dtype=torch.float32), self.specimen.background)
-
-    def errors(self, images: Tensor) -> list[float]:
-        """The largest error over the prisms at each focus plane."""
-        difference = (images - self.images).square().mean((2, 3)).sqrt()
-        return (difference / self.images.std((2, 3), correction=0)).amax(0).tolist()
-
-
-def read() -> Scene:
-    """The smooth ball."""
-    data = _load("exact_ball_dic")
-    ball = GaussianBall(float(data["sigma"]), float(data["delta_peak"]), float(data["n_medium"]))
-    return _scene(data, ball, DEPTH)
-
-
-def read_bead() -> Scene:
-    """The sharp bead."""
-    data = _load("exact_sphere_dic")
-    n0, radius = float(data["n_medium"]), float(data["radius"])
-    return _scene(data, Bead(radius, float(data["n_sphere"]) - n0, n0), 2 * radius)
-
-
-def _load(name: str) -> dict:
-    with np.load(DATA / f"{name}.npz") as file:
-        return {key: file[key] for key in file.files}
-
-
-def _scene(data: dict, specimen: GaussianBall | Bead, depth: float) -> Scene:
-    points = torch.from_numpy(data["source_yx"]) * specimen.background
-    condenser = Condenser(float(points.norm(dim=1).max()), points)
-    prisms = [Prism((float(s[0]), float(s[1])), float(b)) for s, b in zip(data["shear_yx"], data["bias"], strict=True)]
-    return Scene(
-        torch.from_numpy(data["images"]),
-        specimen,
-        depth,
-        float(data["spacing"]),
-        Microscope(float(data["wavelength"]), Objective(float(data["na_objective"])), condenser),
-        Acquisition(prisms, [float(f) for f in data["focus"]]),
-    )
 
 
 @contextmanager
@@ -161,7 +87,7 @@ def ablation(name: Name, scene: Scene, slices: int, rays: Fidelity, padding: int
         "rays": lambda: image(volume, scene.microscope, scene.acquisition, rays),
         "no amplitude": lambda: image(volume, scene.microscope, scene.acquisition, replace(rays, amplitude=False)),
         "at the exit": lambda: image(
-            volume, scene.microscope, scene.acquisition, replace(rays, reference_plane=DEPTH / 2)
+            volume, scene.microscope, scene.acquisition, replace(rays, reference_plane=scene.depth / 2)
         ),
         "textbook screen": lambda: textbook_images(volume, scene, padding, slices),
         "split step": lambda: image(volume, scene.microscope, scene.acquisition, Fidelity("wave", padding=padding)),
@@ -197,8 +123,8 @@ def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMet
 def print_row(label: str, errors: Callable[[], list[float]]) -> None:
     """A row of the table, and how long it took."""
     start = time.perf_counter()
-    row = "  ".join(f"{e:8.4f}" for e in errors())
-    print(f"{label:<44}{row}   {time.perf_counter() - start:7.1f}", flush=True)
+    found = errors()
+    print(row((label,), found, time.perf_counter() - start), flush=True)
 
 
 def print_own_defocus(title: str, scene: Scene, slices: int) -> None:
@@ -227,14 +153,14 @@ def whole(scene: Scene, slices: int, fidelity: Fidelity) -> list[float]:
 
 
 def print_head(title: str, scene: Scene) -> None:
-    """The table's first line."""
-    focus = "  ".join(f"z={float(f):+.0f} µm" for f in scene.acquisition.focus)
-    print(f"{title:<44}{focus}   seconds")
+    """The table's title and first line."""
+    print(f"\n{title}\n")
+    print(header(("propagation",), scene.acquisition.focus))
 
 
 def main() -> None:
     """Print the tables."""
-    scene = read()
+    scene = smooth_ball()
     fine = Fidelity("rays", padding=PADDING, interpolation="linear")
     rows: list[tuple[str, Name, int, Fidelity]] = [
         ("rays, amplitude √(p_z0/(p_z |det|))", "rays", 120, fine),
@@ -249,10 +175,8 @@ def main() -> None:
     print_head("smooth ball", scene)
     for label, name, slices, rays in rows:
         print_row(label, lambda name=name, slices=slices, rays=rays: ablation(name, scene, slices, rays, PADDING))
-    print()
     print_own_defocus("smooth ball", scene, 120)
-    print()
-    print_own_defocus("sharp bead", read_bead(), 80)
+    print_own_defocus("sharp bead", sharp_bead(), 80)
 
 
 if __name__ == "__main__":

@@ -24,16 +24,16 @@ def trial(
     return contrast_errors(images, exact), time.perf_counter() - start
 
 
-def header(names: Sequence[str], focus: Sequence[float]) -> str:
+def header(names: Sequence[str], focus: Sequence[float | Tensor]) -> str:
     """The head of a table: named columns, a column for each focus plane, seconds."""
-    columns = [*names, *(f"{f:+g} µm" if f else "0" for f in focus), "seconds"]
+    columns = [*names, *(f"{float(f):+.3g} µm" if f else "0" for f in focus), "seconds"]
     return _line(columns) + "\n" + "|---" * len(columns) + "|"
 
 
-def row(cells: Sequence[str], errors: Sequence[float], seconds: float) -> str:
+def row(cells: Sequence[str], errors: Sequence[float], seconds: float, digits: str = ".4f") -> str:
     """A row under such a head."""
-    return _line([*cells, *(f"{e:.4f}" for e in errors), f"{seconds:.1f}"])
+    return _line([*cells, *(f"{e:{digits}}" for e in errors), f"{seconds:.1f}"])
 
 
 def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"

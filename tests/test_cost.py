@@ -26,6 +26,7 @@ from torchdic import (
     imaging,
     landing,
 )
+from torchdic.caustics import Tubes
 from torchdic.recompute import TRANSIENT
 from torchdic.sampling import SliceSampler
 from torchdic.space_variant import object_levels
@@ -319,12 +320,39 @@ def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level
     assert float((present() - without()).abs().max()) > 1e-4
     kept_, more = (kept(taking(delta, learned=True, **options, object_aberration=m)) for m in (None, method))
     assert kept_ < more
+    assert peak(without) < peak(present)
 
 
 def test_paraxial_defocus_costs_no_transform(delta, counted, propagation):
     exact, paraxial = (taking(delta, propagation=propagation, defocus=d) for d in ("exact", "paraxial"))
     assert counted(exact) == counted(paraxial)
     assert float((exact() - paraxial()).abs().max()) > 1e-4
+
+
+def test_caustics_are_not_counted_where_a_bound_rules_them_out(delta, counted, monkeypatch):
+    """Rays through a smooth specimen are followed from face to face as if there were no such thing."""
+    function = taking(delta, propagation="rays")
+    cost, most, images = counted(function), peak(function), function()
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
+    assert counted(function) == cost
+    assert torch.equal(function(), images)
+    assert peak(function) == most
+
+
+def test_counting_caustics_takes_neither_transforms_nor_evaluations(delta, counted, monkeypatch):
+    """Tubes are made of the rays that there are: a tenth more of bytes, at once and for the backward pass."""
+    plain = taking(delta, propagation="rays")
+    learned = taking(delta, propagation="rays", learned=True)
+    cost, most, saved, images = counted(plain), peak(plain), kept(learned), plain()
+    looked = []
+    look = Tubes.__call__
+    monkeypatch.setattr(Tubes, "__call__", lambda self, state: looked.append(1) or look(self, state))
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: Tubes(GRID, 1.0))
+    assert counted(plain) == cost
+    assert len(looked) == SLICES
+    assert torch.equal(plain(), images)
+    assert most < peak(plain) < 1.15 * most
+    assert saved < kept(learned) < 1.15 * saved
 
 
 STRAIN = {1: (0.0, 0.0), 6: (0.1, 0.0)}
@@ -362,6 +390,8 @@ def test_pupil_of_matrices_takes_a_field_for_each_state_of_the_light(
     components = 1 if turns and propagation == "rays" else 0
     more = 4 * (states - 1) + 2 * 3 + components
     assert sum(sizes) - fields == more * len(POINTS) * ROWS * COLUMNS
+    if propagation == "projection":  # the others take more than imaging does
+        assert peak(plain) < peak(declared)
 
 
 def test_matrices_are_made_once_for_all_prisms_and_focus_planes(delta, monkeypatch):

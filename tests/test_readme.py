@@ -6,23 +6,25 @@ from pathlib import Path
 import pytest
 import torch
 
+from recon.cli import main
 from recon.config import load
 from recon.reconstruct import load_data, reconstruct
+from torchdic.tiff import read_stack
 
 README = Path(__file__).parents[1] / "README.md"
 
 
-def block(language: str) -> str:
-    (code,) = re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
-    return code
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     """A folder in which the README's simulation was run and its configuration saved."""
     monkeypatch.chdir(tmp_path)
-    exec(block("python"), {})
-    (tmp_path / "cell.toml").write_text(block("toml"), encoding="utf-8")
+    (program,) = blocks("python")
+    exec(program, {})
+    (tmp_path / "cell.toml").write_text(blocks("toml")[0], encoding="utf-8")
     return tmp_path
 
 
@@ -30,6 +32,21 @@ def test_the_simulation_writes_the_stack_that_the_configuration_reads(folder):
     data = load_data(load(folder / "cell.toml")).data
     assert data.shape == (2, 3, 64, 72)
     assert data.std() > 0.01
+
+
+def test_the_further_tables_go_into_the_configuration_and_are_simulated(tmp_path):
+    path = tmp_path / "more.toml"
+    path.write_text("".join(blocks("toml")), encoding="utf-8")
+    config = load(path)
+    assert config.microscope.polarisation.pupil.strained
+    assert config.microscope.polarisation.pupil.depolarisation
+    assert (config.fidelity.object_aberration, config.fidelity.defocus) == ("cone", "paraxial")
+    assert main(["simulate", str(path), "--out", str(tmp_path / "out")]) == 0
+    stack = read_stack(tmp_path / "out" / "stack.ome.tif").data
+    assert stack.shape == (2, 3, 64, 72)
+    # walls along y: nothing changes along them, in float32
+    assert abs(stack - stack[:, :, :1]).max() < 1e-5
+    assert stack[0].std() > stack[1].std() > 0.01
 
 
 @pytest.mark.slow

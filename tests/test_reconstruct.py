@@ -37,7 +37,7 @@ CONFIG = {
         "prisms": [{"shear": [0.0, 0.24], "bias": 1.5}, {"shear": [0.24, 0.0], "bias": -1.2}],
     },
     "fidelity": {"sources": 6, "order": 1},
-    "reconstruction": {"steps": 120, "checkpoint_every": 5, "draft_sources": 3},
+    "reconstruction": {"steps": 60, "checkpoint_every": 5, "draft_sources": 3},
     "specimen": {"kind": "gaussian_ball", "sigma": 0.5, "contrast": 0.02, "centre": [0.3, -0.3, 0.4]},
     "data": {"path": "simulated/stack.ome.tif"},
 }
@@ -210,7 +210,7 @@ def test_the_metrics_are_those_of_the_volume_left(workplace):
     assert metrics["misfit"] < 0.02
     assert metrics["residual_rms"] == pytest.approx(((images - data) ** 2).mean((1, 2, 3)).sqrt().tolist(), rel=1e-4)
     assert metrics["delta"]["max"] == float(found.max())
-    assert metrics["steps"] == 120
+    assert metrics["steps"] == 60
     assert metrics["propagation"] == "wave"
     assert [report["bias"] for report in metrics["prisms"]] == [1.5, -1.2]
 
@@ -218,7 +218,7 @@ def test_the_metrics_are_those_of_the_volume_left(workplace):
 def test_the_log_has_every_step_once(workplace):
     log = rows(workplace / "whole")
     assert list(log[0]) == ["step", "misfit", "loss", "seconds"]
-    assert [int(row["step"]) for row in log] == list(range(1, 121))
+    assert [int(row["step"]) for row in log] == list(range(1, 61))
     assert float(log[-1]["misfit"]) < 0.1 * float(log[0]["misfit"])
     assert all(float(row["loss"]) >= float(row["misfit"]) > 0 for row in log)
 
@@ -376,7 +376,7 @@ def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
 def long(workplace):
     """(configuration, folder of results) of an uninterrupted run that takes long enough to be hit on its way."""
     path = workplace / "long.toml"
-    path.write_text(merged({"reconstruction": {"steps": 250}}), encoding="utf-8")
+    path.write_text(merged({"reconstruction": {"steps": 80}}), encoding="utf-8")
     assert command("reconstruct", path, "--out", workplace / "long")[0] == 0
     return path, workplace / "long"
 
@@ -411,7 +411,7 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     out = tmp_path / "out"
     code, err = interrupted(path, out, getattr(signal, name))
     done = len(rows(out))
-    assert 12 <= done < 250
+    assert 12 <= done < 80
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
     assert not RESULTS - {"log.csv"} & set(content(out))  # no result is there before its time
     if name == "SIGKILL":
@@ -419,12 +419,12 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
         assert done - kept <= 5  # at most one interval
     else:
         assert code == 130
-        assert f"torchdic: error: interrupted after step {kept} of 250; go on with --resume" in err
+        assert f"torchdic: error: interrupted after step {kept} of 80; go on with --resume" in err
         assert "Traceback" not in err
         assert kept == done
     assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
     assert torch.equal(volume(out), volume(whole))
-    assert [row["step"] for row in rows(out)] == [str(number) for number in range(1, 251)]
+    assert [row["step"] for row in rows(out)] == [str(number) for number in range(1, 81)]
     for column in ("misfit", "loss"):
         assert [row[column] for row in rows(out)] == [row[column] for row in rows(whole)]
     assert {name for name in content(out) if not name.startswith(".")} == RESULTS

@@ -1,4 +1,5 @@
-"""Images of known answer in tests/data: their README says who computed them, and how. None is ours."""
+"""Images of known answer in tests/data: docs/validation.md says who computed them. None of our
+propagations had a part."""
 
 import pytest
 import torch
