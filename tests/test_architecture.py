@@ -47,11 +47,13 @@ CONTRACT = {
     "Grid",
     "Microscope",
     "Objective",
+    "Plan",
     "Prism",
     "Rays",
     "Volume",
     "image",
     "image_field",
+    "plan",
     "trace",
 }
 
