@@ -32,13 +32,13 @@ from torchdic.microscope import Acquisition, Microscope, SamplingWarning, check_
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
 
-# Least standard deviation, in units of the empty bright field, that an image's error is compared with: the shot noise of
-# a million electrons, below any camera's. It gives an empty scene's error a meaning.
+# Least standard deviation, in units of the empty bright field, that an image's error is compared with: the shot noise
+# of a million electrons, below any camera's. It gives an empty scene's error a meaning.
 FLOOR = 1e-3
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
 MARGIN = 0.6
 # Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be.
-COUNTS = (1, 4, 8, 18, 32, 50, 72, 128, 200, 392)
+COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
 # Voxels along each side of a pilot's window; the whole array if it isn't much wider.
 WINDOW = 64
 # Reach of a lens's own blur in wavelengths over NA: the tail that a pupil's edge leaves falls off slowly.
@@ -137,8 +137,8 @@ def _relative(difference: Tensor, truth: Tensor) -> float:
 def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
     """The cheapest Fidelity whose images err by at most `tolerance` (see `image_error`), and what each effect is worth.
 
-    Where the specimen stays clear of the sides the truth is the specimen alone in its medium; where it reaches them, the
-    periodic array that `image` computes without padding. Nothing in it is random, and no choice hangs on a clock.
+    Where the specimen stays clear of the sides the truth is the specimen alone in its medium; where it reaches them,
+    the periodic array that `image` computes without padding. Nothing in it is random, and no choice hangs on a clock.
     Raises ValueError for a tolerance that isn't positive, and as `image` does. Warns ToleranceWarning where no fidelity
     meets the tolerance: the plan is then the best one found.
     """
@@ -201,7 +201,7 @@ def _plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tole
         truth = truth + dense - sparse
     else:
         counts = [_Choice(_given(microscope), torch.zeros_like(truth))]
-    sides = _sides(volume, microscope, pilot.acquisition, few)
+    sides = _sides(volume, microscope, pilot.acquisition)
 
     def total(way: _Choice, count: _Choice, side: tuple[int, float]) -> float:
         return math.hypot(_relative(way.lacks + count.lacks, truth), side[1])
@@ -235,29 +235,38 @@ def _sources(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
     if condenser is None or condenser.points is not None or condenser.na == 0:
         return [], pilot(pilot.coarse)
     seen: list[tuple[Fidelity, Tensor]] = []
+    previous = last = torch.zeros(())
+    left = 0.0
     for count in COUNTS:
         if condenser.inner_na is not None and count < 2:
             continue
         seen.append((replace(pilot.coarse, sources=count), pilot(replace(pilot.coarse, sources=count))))
-        # 8 sources may agree with 4 by chance, 18 with 8 hardly
-        if count >= 18 and _relative(seen[-1][1] - seen[-2][1], seen[-1][1]) <= MARGIN / 3 * tolerance:
+        if count < 18:
+            continue  # fewer may agree by chance
+        (_, before), (_, previous), (_, last) = seen[-3:]
+        moved, still = _relative(previous - before, last), _relative(last - previous, last)
+        fall = min(max(still / max(moved, 1e-300), 0.2), 0.5)
+        left = fall / (1 - fall)  # what a geometric series has left after its last term
+        if left * still <= MARGIN / 2 * tolerance:
             break
-    else:
-        dense = seen[-1][1]
-        return [_Choice(f, i - dense) for f, i in seen[:-1]] + [_Choice(seen[-1][0], dense - seen[-2][1])], dense
-    dense = seen[-1][1]
-    return [_Choice(f, i - dense) for f, i in seen[:-1]], dense
+    dense = last + left * (last - previous)
+    return [_Choice(f, i - dense) for f, i in seen], dense
 
 
 def _fewer(pilot: _Pilot, counts: Sequence[_Choice], dense: Tensor, tolerance: float) -> _Pilot:
     """The pilot with as few sources as tell its ways of crossing the specimen apart."""
-    condenser = pilot.microscope.condenser
-    if condenser is None:
-        return pilot
     wanted = 18
     if counts:
         enough = (c.fidelity.sources for c in counts if _relative(c.lacks, dense) <= 0.1)
         wanted = min(max(next(enough, 18), 8), 18)
+    return _lit(pilot, wanted)
+
+
+def _lit(pilot: _Pilot, wanted: int) -> _Pilot:
+    """The pilot with so many sources at most, a few of the condenser's own where it names them."""
+    condenser = pilot.microscope.condenser
+    if condenser is None:
+        return pilot
     points, weights = condenser.sources(wanted, dtype=torch.float64)
     if len(points) > wanted:
         some = torch.linspace(0, len(points) - 1, wanted).round().long()
@@ -275,13 +284,13 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
             runs[steps, order] = pilot(Fidelity("wave", steps=steps, order=1 if order == 1 else 2))
         return runs[steps, order]
 
-    fine = max(slices, 4)
-    ladder = [-(-fine // 4), -(-fine // 2), fine]
+    fine = max(slices, 2)
+    ladder = [-(-fine // 2), fine, 2 * fine]  # slabs that merge slices tell nothing of those that divide them
     while True:
         coarser, middle, finest = (run(m) for m in ladder[-3:])
         last = _relative(finest - middle, finest)
         # between first order, at edges, and the split step's second
-        ratio = min(max(_relative(middle - coarser, finest) / max(last, 1e-300), 2.0), 4.0)
+        ratio = min(max(_relative(middle - coarser, finest) / max(last, 1e-300), 1.5), 4.0)
         if last / (ratio - 1) <= MARGIN / 2 * tolerance or ladder[-1] >= 8 * slices:
             break
         ladder.append(2 * ladder[-1])
@@ -291,34 +300,29 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
     for order in (2, 1):
         steps = ladder[-1]
         while steps >= 1:
-            ways.append(
-                _Choice(
-                    Fidelity("wave", steps=steps, order=1 if order == 1 else 2), run(steps, order) - truth
-                )
-            )
+            ways.append(_Choice(Fidelity("wave", steps=steps, order=1 if order == 1 else 2), run(steps, order) - truth))
             if steps == 1 or _relative(ways[-1].lacks, truth) > 4 * tolerance:
                 break
             steps = -(-steps // 2)
     return ways, truth
 
 
-def _sides(
-    volume: Volume, microscope: Microscope, acquisition: Acquisition, few: _Pilot
-) -> list[tuple[int, float]]:
+def _sides(volume: Volume, microscope: Microscope, acquisition: Acquisition) -> list[tuple[int, float]]:
     """Paddings in voxels, each with the error that light which comes back on the other side leaves."""
     width = _needed_padding(volume, microscope, acquisition)
     if width == 0:
         return [(0, 0.0)]
-    whole = _Pilot(volume, few.microscope, acquisition)
+    # few sources make more fringes than many, so this takes more of them
+    whole = _lit(_Pilot(volume, microscope, acquisition), 32)
     widths = sorted({0, -(-width // 4), -(-width // 2), width})
     images = [whole(replace(whole.coarse, steps=min(whole.slices, 2), padding=w)) for w in widths]
     errors = [_relative(i - images[-1], images[-1]) for i in images]
-    left = errors[-2] / 2  # the blur's tail falls off slowly: so much lies beyond the widest
+    left = errors[-2] / 3  # the blur's tail falls off slowly: so much lies beyond the widest
     return [(w, e + left) for w, e in zip(widths, errors, strict=True)]
 
 
 def _needed_padding(volume: Volume, microscope: Microscope, acquisition: Acquisition) -> int:
-    """Voxels on each side beyond which no light of the recorded cone comes back; 0 where the specimen reaches a side."""
+    """Voxels on each side beyond which no recorded light comes back; 0 where the specimen reaches a side."""
     grid, strength = volume.grid, volume.delta.abs()
     if volume.absorption is not None:
         strength = strength + volume.absorption
@@ -454,26 +458,19 @@ def _through_pixels(images: Tensor, grid: Grid, pixel: tuple[float, float]) -> T
     return torch.fft.ifft2(torch.fft.fft2(images) * window).real
 
 
-def _ladder(
-    few: _Pilot, straight: float, tolerance: float
-) -> list[tuple[tuple[str, float, str], str]]:
+def _ladder(few: _Pilot, straight: float, tolerance: float) -> list[tuple[tuple[str, float, str], str]]:
     """What each rung between straight rays and waves adds; bounds where projection is good enough or rays fail.
 
-    Rays cost so much that they see a smaller window, at four directions and in few steps.
+    Rays cost so much that they see a smaller window, at three directions and in few steps.
     """
     names = "bending", "amplitude", "diffraction", "object aberration"
     whole = "all that projection lacks"
     if straight <= tolerance / 2:
         return [((name, straight, whole), "bound") for name in names]
-    microscope = few.microscope
-    condenser = microscope.condenser
-    if condenser is not None and condenser.points is not None and len(condenser.points) > 4:
-        some = torch.linspace(0, len(condenser.points) - 1, 4).round().long()
-        weights = None if condenser.weights is None else condenser.weights[some]
-        microscope = replace(microscope, condenser=Condenser(condenser.na, condenser.points[some], weights))
     focus = [few.acquisition.focus[0], few.acquisition.focus[-1]]
-    small = _Pilot(_window(few.volume, 40), microscope, Acquisition(few.acquisition.prisms[:1], focus))
-    rays = Fidelity("rays", steps=min(small.slices, 16))
+    small = _Pilot(_window(few.volume, 32), few.microscope, Acquisition(few.acquisition.prisms[:1], focus))
+    small = _lit(small, 3)
+    rays = Fidelity("rays", steps=min(small.slices, 12))
     try:
         projected = small(Fidelity("projection"))
         bent = small(replace(rays, amplitude=False))
@@ -488,7 +485,7 @@ def _ladder(
         (("diffraction", _relative(wave - carried, wave), "the wave against rays"), "pilot"),
     ]
     try:
-        own = small(Fidelity("projection", object_aberration="linear", steps=min(small.slices, 16)))
+        own = small(Fidelity("projection", object_aberration="linear", steps=min(small.slices, 12)))
         note = "in straight rays; the wave has it already"
         rows.append((("object aberration", _relative(own - projected, wave), note), "pilot"))
     except ValueError:
@@ -556,7 +553,7 @@ def _window(volume: Volume, side: int) -> Volume:
 
 
 def _extremes(acquisition: Acquisition, plane: float) -> Acquisition:
-    """The images that are hardest: the darkest, brightest and most sheared prism, the farthest focus and the nearest."""
+    """The hardest images: the darkest, brightest and most sheared prism, the farthest focus and the nearest."""
     prisms = acquisition.prisms
     levels = [1.0 if p is None else math.sin(float(torch.as_tensor(p.bias)) / 2) ** 2 for p in prisms]
     shears = [0.0 if p is None else float(torch.as_tensor(p.shear).norm()) for p in prisms]
