@@ -87,7 +87,8 @@ def descend(
     """Fit a volume to images relative to the empty bright field; yields every step.
 
     data sets dtype and device. fidelity: or a tolerance of the images, for which one is planned, and again each time
-    the volume has doubled; draft_sources then has no say. resume: the step to go on from; the rest is as if there had been no interruption.
+    the volume has doubled; draft_sources then has no say. resume: the step to go on from; the rest is as if there had
+    been no interruption.
     Raises ValueError where the data's shape is not the acquisition's, or FloatingPointError where the fit diverges.
     """
     expected = (len(acquisition.prisms), len(acquisition.focus), *grid.shape[1:])

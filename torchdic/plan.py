@@ -43,7 +43,7 @@ COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
 WINDOW = 64
 # Reach of a lens's own blur in wavelengths over NA: the tail that a pupil's edge leaves falls off slowly.
 BLUR = 12.0
-# Slabs of pilots that ask about something other than slabs.
+# Slabs at least of pilots that ask about something other than slabs.
 COARSE = 4
 # Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels.
 SETUP, IMAGE, ABSORBING = 30.0, 4.5, 27.0
@@ -179,15 +179,20 @@ class _Pilot:
 
     @property
     def coarse(self) -> Fidelity:
-        return Fidelity("wave", steps=min(self.slices, COARSE), order=1)
+        """For what has nothing to do with slabs, in slabs half as deep as the objective's field or thinner."""
+        grid, n0, objective = self.volume.grid, float(self.volume.background), self.microscope.objective
+        na = n0 if objective is None else objective.na
+        deepest = n0 * self.microscope.wavelength / (2 * na**2)
+        return Fidelity("wave", steps=min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest))), order=1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Choice:
-    """One way to compute, and the images by which it falls short."""
+    """One way to compute, the images by which it falls short of the best one tried, and what that one may lack."""
 
     fidelity: Fidelity
     lacks: Tensor
+    beyond: float = 0.0
 
 
 def _plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
@@ -204,7 +209,7 @@ def _plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tole
     sides = _sides(volume, microscope, pilot.acquisition)
 
     def total(way: _Choice, count: _Choice, side: tuple[int, float]) -> float:
-        return math.hypot(_relative(way.lacks + count.lacks, truth), side[1])
+        return math.hypot(_relative(way.lacks + count.lacks, truth), count.beyond, side[1])
 
     def joined(way: _Choice, count: _Choice, side: tuple[int, float]) -> Fidelity:
         return replace(way.fidelity, sources=count.fidelity.sources, padding=side[0])
@@ -235,22 +240,24 @@ def _sources(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
     if condenser is None or condenser.points is not None or condenser.na == 0:
         return [], pilot(pilot.coarse)
     seen: list[tuple[Fidelity, Tensor]] = []
-    previous = last = torch.zeros(())
-    left = 0.0
+    beyond = 0.0
     for count in COUNTS:
         if condenser.inner_na is not None and count < 2:
             continue
         seen.append((replace(pilot.coarse, sources=count), pilot(replace(pilot.coarse, sources=count))))
-        if count < 18:
+        if count < 18 or len(seen) < 3:
             continue  # fewer may agree by chance
         (_, before), (_, previous), (_, last) = seen[-3:]
-        moved, still = _relative(previous - before, last), _relative(last - previous, last)
-        fall = min(max(still / max(moved, 1e-300), 0.2), 0.5)
-        left = fall / (1 - fall)  # what a geometric series has left after its last term
-        if left * still <= MARGIN / 2 * tolerance:
+        still = _relative(last - previous, last)
+        # behind a sharp pupil the error falls as 1/K at worst; a geometric fall shows in three numbers above a few
+        left = min(1 / (count / seen[-2][0].sources - 1), 1.0)
+        if seen[-3][0].sources > 1:
+            fall = min(still / max(_relative(previous - before, last), 1e-300), 0.9)
+            left = min(left, max(fall / (1 - fall), 0.1))
+        beyond = left * still
+        if beyond <= MARGIN / 2 * tolerance:
             break
-    dense = last + left * (last - previous)
-    return [_Choice(f, i - dense) for f, i in seen], dense
+    return [_Choice(f, i - seen[-1][1], beyond) for f, i in seen], seen[-1][1]
 
 
 def _fewer(pilot: _Pilot, counts: Sequence[_Choice], dense: Tensor, tolerance: float) -> _Pilot:
@@ -315,7 +322,7 @@ def _sides(volume: Volume, microscope: Microscope, acquisition: Acquisition) -> 
     # few sources make more fringes than many, so this takes more of them
     whole = _lit(_Pilot(volume, microscope, acquisition), 32)
     widths = sorted({0, -(-width // 4), -(-width // 2), width})
-    images = [whole(replace(whole.coarse, steps=min(whole.slices, 2), padding=w)) for w in widths]
+    images = [whole(replace(whole.coarse, padding=w)) for w in widths]
     errors = [_relative(i - images[-1], images[-1]) for i in images]
     left = errors[-2] / 3  # the blur's tail falls off slowly: so much lies beyond the widest
     return [(w, e + left) for w, e in zip(widths, errors, strict=True)]
