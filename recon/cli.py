@@ -65,6 +65,8 @@ SPECIMENS: dict[str, type] = {
     "graded_index_rod": GradedIndexRod,
     "layered_medium": LayeredMedium,
 }
+# Of a plan whose configuration names none.
+USUAL_TOLERANCE = 0.01
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
@@ -161,13 +163,12 @@ def _plan(options: argparse.Namespace) -> None:
     config = load(options.config)
     specimen = _specimen(config, str(options.config))
     _check_background(specimen, config, options.config)
-    if config.tolerance is None:
-        raise ConfigError(f"{options.config}: missing key tolerance: a plan needs one, such as tolerance = 0.01")
+    tolerance = USUAL_TOLERANCE if config.tolerance is None else config.tolerance
     if options.out is not None:
         prepare_folder(options.out)
     grid = config.volume.grid
     delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-    planned = plan(Volume(grid, delta, specimen.background), config.microscope, config.acquisition, config.tolerance)
+    planned = plan(Volume(grid, delta, specimen.background), config.microscope, config.acquisition, tolerance)
     print(planned.table())
     if options.out is not None:
         _write_json(options.out / "plan.json", planned.as_dict())
@@ -201,7 +202,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
 
 def _specimen(config: Config, source: str) -> Any:
     if config.specimen is None:
-        raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
+        raise ConfigError(f"{source}: missing key specimen: a simulation or plan needs one")
     values = dict(config.specimen)
     kind = values.pop("kind", None)
     if not isinstance(kind, str) or kind not in SPECIMENS:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from data_synthetic import Bead, CellPhantom, GaussianBall
 from recon import reconstruct
 from recon.cli import main
+from recon.config import dump, load
 from recon.planned import GROWTH, current, follow, strength
 from torchdic import (
     REFERENCE,
@@ -419,6 +420,15 @@ def run(*arguments):
     return main([str(a) for a in arguments])
 
 
+def test_tolerance_is_read_from_the_file_and_written_back(write, tmp_path):
+    config = load(write())
+    assert (config.tolerance, config.fidelity) == (0.2, None)
+    path = tmp_path / "again.toml"
+    path.write_text(dump(config), encoding="utf-8")
+    assert load(path).tolerance == 0.2
+    assert load(write(tolerance=None)).tolerance is None
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_plan_prints_its_table_and_leaves_it_as_json(write, tmp_path, capsys):
     assert run("plan", write()) == 0
@@ -434,7 +444,6 @@ def test_plan_prints_its_table_and_leaves_it_as_json(write, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("command", "changes", "words"),
     [
-        ("plan", {"tolerance": None}, "missing key tolerance"),
         ("plan", {"specimen": None}, "missing key specimen"),
         ("plan", {"tolerance": -1.0}, "tolerance -1.0 must be above 0, and finite"),
         ("plan", {"tolerance": "fine"}, "'fine' must be a number"),
@@ -472,8 +481,7 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("number", [4, 9])
-def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch, number):
+def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch):
     path = write()
     assert run("simulate", path, "--out", tmp_path / "out") == 0
     assert run("reconstruct", path, "--out", tmp_path / "whole") == 0
@@ -481,7 +489,7 @@ def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypat
 
     def descend(*arguments):
         for step in original(*arguments):
-            if step.number == number:
+            if step.number == 6:  # between two plans
                 raise KeyboardInterrupt
             yield step
 
