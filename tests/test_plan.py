@@ -125,7 +125,8 @@ def coherent():
 
 
 def wide_condenser():
-    return Scene(gaussian(0.02, 1.0), 0.1, Microscope(0.546, Objective(0.9), Condenser(0.8)))
+    grid = Grid((12, 44, 48), (0.4, 0.16, 0.16))
+    return Scene(gaussian(0.02, 0.6, grid), 0.1, Microscope(0.546, Objective(0.9), Condenser(0.8)))
 
 
 def far_out_of_focus():
