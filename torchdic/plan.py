@@ -530,10 +530,10 @@ def _detached(volume: Volume) -> Volume:
 def _window(volume: Volume, side: int) -> Volume:
     """The part of a volume, about `side` voxels wide, where Δn varies most, faded out towards its own sides.
 
-    An axis up to half as long again is kept whole.
+    An axis up to a quarter as long again is kept whole.
     """
     shape = volume.grid.shape
-    size = [n if n <= 1.5 * side else side for n in shape[1:]]
+    size = [n if n <= 1.25 * side else side for n in shape[1:]]
     if size == list(shape[1:]):
         return volume
     strength = volume.delta if volume.absorption is None else volume.delta.abs() + volume.absorption
