@@ -1,12 +1,14 @@
-"""The command line: torchdic demo | simulate | reconstruct."""
+"""The command line: torchdic demo | simulate | plan | reconstruct."""
 
 import argparse
+import json
 import math
 import os
 import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,8 +32,9 @@ from data_synthetic import (
 from recon import figures
 from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
-from recon.config import Config, ConfigError, load, structure
+from recon.config import Config, ConfigError, dump, load, structure
 from recon.descend import Recipe
+from recon.planned import announce
 from recon.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
 from recon.simulate import exact_images
 from torchdic import (
@@ -44,9 +47,12 @@ from torchdic import (
     Objective,
     Prism,
     SamplingWarning,
+    ToleranceWarning,
     Volume,
     image,
+    plan,
 )
+from torchdic.files import written_whole
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
 from torchdic.wave import UnstableError
@@ -60,6 +66,8 @@ SPECIMENS: dict[str, type] = {
     "graded_index_rod": GradedIndexRod,
     "layered_medium": LayeredMedium,
 }
+# Of a plan whose configuration names none.
+USUAL_TOLERANCE = 0.01
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
@@ -67,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, or 2 for bad input, 130 for an interruption."""
     options = _parser().parse_args(arguments)
     warnings.showwarning = _show_each_once()
-    warnings.simplefilter("always", SamplingWarning)
+    for kind in (SamplingWarning, ToleranceWarning):
+        warnings.simplefilter("always", kind)
     try:
         options.command(options)
     except (ConfigError, StackError, CheckpointError) as error:
@@ -120,11 +129,9 @@ def _simulate(options: argparse.Namespace) -> None:
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
     fidelity = config.fidelity or STANDARD
-    if specimen.background != config.volume.background:
-        raise ConfigError(
-            f"{options.config}: specimen.background {specimen.background} differs from volume.background "
-            f"{config.volume.background}"
-        )
+    _check_background(specimen, config, options.config)
+    if config.simulation.exact and config.tolerance is not None:
+        raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
     if config.simulation.exact and not hasattr(specimen, "field"):
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     prepare_folder(options.out)
@@ -133,7 +140,16 @@ def _simulate(options: argparse.Namespace) -> None:
     else:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-            images = image(Volume(grid, delta, specimen.background), microscope, acquisition, fidelity).cpu()
+            volume = Volume(grid, delta, specimen.background)
+            if config.tolerance is not None:
+                planned = plan(volume, microscope, acquisition, config.tolerance)
+                print(announce(planned), flush=True)
+                fidelity = planned.fidelity
+                _write_json(options.out / "plan.json", planned.as_dict())
+                resolved = replace(config, fidelity=fidelity, tolerance=None)
+                with written_whole(options.out / "config.resolved.toml") as partial:
+                    partial.write_text(f"# {announce(planned)}\n{dump(resolved)}", encoding="utf-8")
+            images = image(volume, microscope, acquisition, fidelity).cpu()
     pixel = grid.spacing[1:]
     if microscope.camera is not None:
         pixel = microscope.camera.pixel_spacing(pixel)
@@ -144,6 +160,34 @@ def _simulate(options: argparse.Namespace) -> None:
     write_stack(options.out / "stack.ome.tif", data, pixel, _equal_step(focus))
     figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), options.out / "stack.png")
     print(f"{options.out / 'stack.ome.tif'}: {_counts(images.shape)}")
+
+
+def _plan(options: argparse.Namespace) -> None:
+    config = load(options.config)
+    specimen = _specimen(config, str(options.config))
+    _check_background(specimen, config, options.config)
+    tolerance = USUAL_TOLERANCE if config.tolerance is None else config.tolerance
+    if options.out is not None:
+        prepare_folder(options.out)
+    grid = config.volume.grid
+    delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
+    planned = plan(Volume(grid, delta, specimen.background), config.microscope, config.acquisition, tolerance)
+    print(planned.table())
+    if options.out is not None:
+        _write_json(options.out / "plan.json", planned.as_dict())
+
+
+def _check_background(specimen: Any, config: Config, source: Path) -> None:
+    if specimen.background != config.volume.background:
+        raise ConfigError(
+            f"{source}: specimen.background {specimen.background} differs from volume.background "
+            f"{config.volume.background}"
+        )
+
+
+def _write_json(path: Path, values: dict[str, Any]) -> None:
+    with written_whole(path) as partial:
+        partial.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
@@ -161,7 +205,7 @@ def _reconstruct(options: argparse.Namespace) -> None:
 
 def _specimen(config: Config, source: str) -> Any:
     if config.specimen is None:
-        raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
+        raise ConfigError(f"{source}: missing key specimen: a simulation or plan needs one")
     values = dict(config.specimen)
     kind = values.pop("kind", None)
     if not isinstance(kind, str) or kind not in SPECIMENS:
@@ -208,6 +252,11 @@ def _parser() -> argparse.ArgumentParser:
     demo.set_defaults(command=_demo)
     simulate = commands.add_parser("simulate", parents=[config, out, device], help="DIC stack of a specimen")
     simulate.set_defaults(command=_simulate)
+    planner = commands.add_parser(
+        "plan", parents=[config, device], help="which effects a scene calls for, and the cheapest fidelity"
+    )
+    planner.add_argument("--out", type=Path, metavar="DIR", help="folder for plan.json")
+    planner.set_defaults(command=_plan)
     fit = commands.add_parser("reconstruct", parents=[config, out, device], help="index volume behind a DIC stack")
     again = fit.add_mutually_exclusive_group()
     again.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR, if there is one")

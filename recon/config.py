@@ -135,7 +135,8 @@ class SimulationSection:
 class Config:
     """All sections of a configuration file.
 
-    fidelity: None leaves it to the command. specimen: left to `data_synthetic`, which knows its kinds.
+    fidelity: None leaves it to the command. tolerance: of the images, for which a fidelity is planned, see
+    `torchdic.plan`; the two exclude each other. specimen: left to `data_synthetic`, which knows its kinds.
     """
 
     volume: VolumeSection
@@ -146,8 +147,14 @@ class Config:
     reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None
+    tolerance: float | None = None
 
     def __post_init__(self) -> None:
+        if self.tolerance is not None:
+            if self.fidelity is not None:
+                raise ValueError(f"tolerance {self.tolerance} and [fidelity] exclude each other: leave one out")
+            if not (0 < self.tolerance < math.inf):
+                raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
         check_apertures(self.microscope, self.volume.background)
 
 

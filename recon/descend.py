@@ -14,6 +14,7 @@ from torch import Tensor
 from recon.bounds import Bounds
 from recon.initial import linear_start
 from recon.misfit import gaussian, spatial_variance
+from recon.planned import PlanRecord, current, follow
 from recon.regularisers import magnitude, total_variation
 from recon.schedule import cosine, held_then_annealed
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
@@ -60,6 +61,7 @@ class Step:
 
     number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it.
     seconds: that the descent has taken, its start included. parameter, optimiser: the learned tensor, Adam's state.
+    plans: all made for a tolerance so far, the last being that of the current fidelity.
     """
 
     number: int
@@ -69,6 +71,7 @@ class Step:
     seconds: float
     parameter: Tensor
     optimiser: dict[str, Any]
+    plans: tuple[PlanRecord, ...] = ()
 
 
 def descend(
@@ -77,13 +80,15 @@ def descend(
     background: float,
     microscope: Microscope,
     acquisition: Acquisition,
-    fidelity: Fidelity,
+    fidelity: Fidelity | float,
     recipe: Recipe,
     resume: Step | None = None,
 ) -> Iterator[Step]:
     """Fit a volume to images relative to the empty bright field; yields every step.
 
-    data sets dtype and device. resume: the step to go on from; the rest is as if there had been no interruption.
+    data sets dtype and device. fidelity: or a tolerance of the images, for which one is planned, and again each time
+    the volume has doubled; draft_sources then has no say. resume: the step to go on from; the rest is as if there had
+    been no interruption.
     Raises ValueError where the data's shape is not the acquisition's, or FloatingPointError where the fit diverges.
     """
     expected = (len(acquisition.prisms), len(acquisition.focus), *grid.shape[1:])
@@ -97,6 +102,7 @@ def descend(
     else:
         first, seconds = resume.number, resume.seconds
         parameter = resume.parameter.to(data).clone()
+    plans = () if resume is None else resume.plans
     parameter.requires_grad_(True)
     adam = torch.optim.Adam([parameter], lr=recipe.learning_rate)
     if resume is not None:
@@ -105,7 +111,12 @@ def descend(
     for number in range(first, recipe.steps):
         adam.param_groups[0]["lr"] = cosine(number, recipe.steps, recipe.learning_rate)
         delta = recipe.bounds.delta(parameter)
-        images = image(Volume(grid, delta, background), microscope, acquisition, _draft(fidelity, recipe, number))
+        if isinstance(fidelity, Fidelity):
+            careful = _draft(fidelity, recipe, number)
+        else:
+            plans = follow(plans, number, delta, grid, background, microscope, acquisition, fidelity)
+            careful = current(plans)
+        images = image(Volume(grid, delta, background), microscope, acquisition, careful)
         misfit = gaussian(images, data, variance)
         loss = misfit
         tv = held_then_annealed(number, recipe.steps, *recipe.tv)
@@ -131,6 +142,7 @@ def descend(
             seconds + time.perf_counter() - started,
             parameter.detach().clone(),
             copy.deepcopy(adam.state_dict()),
+            plans,
         )
 
 

@@ -22,6 +22,7 @@ from recon.descend import Step, descend
 from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
 from recon.misfit import gaussian, spatial_variance
+from recon.planned import announce_record, current
 from torchdic import Fidelity, Volume, image
 from torchdic.files import written_whole
 from torchdic.tiff import StackError, read_stack, write_volume
@@ -92,8 +93,9 @@ def reconstruct(
     Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; InterruptedRunError on
     Ctrl-C, with a checkpoint saved.
     """
-    fidelity = config.fidelity or RECOMMENDED
-    config = replace(config, fidelity=fidelity)
+    fidelity = config.tolerance or config.fidelity or RECOMMENDED
+    if isinstance(fidelity, Fidelity):
+        config = replace(config, fidelity=fidelity)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
     identity = _identity(config, measured)
@@ -108,11 +110,16 @@ def reconstruct(
 
     last, rows = _descend(config, fidelity, data, out, identity, start)
     grid = config.volume.grid
+    plans = list(last.plans)
+    if not isinstance(fidelity, Fidelity):
+        fidelity = current(last.plans)
     with torch.no_grad():
         volume = Volume(grid, last.delta, config.volume.background)
         modelled = image(volume, config.microscope, config.acquisition, fidelity).cpu()
     data, delta = data.cpu(), last.delta.cpu()
     metrics: dict[str, Any] = {"propagation": fidelity.propagation, **_metrics(measured, modelled, data, delta, last)}
+    if plans:
+        metrics["plans"] = plans
     if metrics["misfit"] > 1:
         warnings.warn(
             f"the misfit {metrics['misfit']:.3g} is above 1: empty medium would explain the stack better; "
@@ -121,7 +128,8 @@ def reconstruct(
             stacklevel=2,
         )
     write_volume(out / "volume.ome.tif", delta, grid)
-    _write_text(out / "config.resolved.toml", dump(config))
+    comments = "".join(f"# {announce_record(record)}\n" for record in plans)
+    _write_text(out / "config.resolved.toml", comments + dump(config))
     _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     prisms, focus = config.acquisition.prisms, measured.focus
     figures.save(figures.draw_images(data, modelled, prisms, focus, grid), out / "images.png")
@@ -155,11 +163,12 @@ def prepare_folder(out: Path) -> None:
 
 
 def _descend(
-    config: Config, fidelity: Fidelity, data: Tensor, out: Path, identity: str, start: Checkpoint | None
+    config: Config, fidelity: Fidelity | float, data: Tensor, out: Path, identity: str, start: Checkpoint | None
 ) -> tuple[Step, list[Row]]:
     section = config.reconstruction
     rows = [] if start is None else list(start.rows)
     step = None if start is None else start.step
+    announced = 0 if step is None else len(step.plans)
     steps = descend(
         data,
         config.volume.grid,
@@ -175,6 +184,9 @@ def _descend(
             for step in steps:
                 rows.append(_row(step))
                 log.writerow(rows[-1])
+                for record in step.plans[announced:]:
+                    tqdm.write(announce_record(record))
+                announced = len(step.plans)
                 bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
                 bar.update()
                 if step.number % section.checkpoint_every == 0:

@@ -49,11 +49,13 @@ CONTRACT = {
     "Grid",
     "Microscope",
     "Objective",
+    "Plan",
     "Prism",
     "Rays",
     "Volume",
     "image",
     "image_field",
+    "plan",
     "trace",
 }
 

@@ -18,6 +18,7 @@ from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
+from torchdic.plan import Effect, Plan, ToleranceWarning, plan
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace
 from torchdic.volume import Volume
@@ -29,22 +30,26 @@ __all__ = [
     "Acquisition",
     "Camera",
     "Condenser",
+    "Effect",
     "Fidelity",
     "Grid",
     "JonesPupil",
     "Layer",
     "Microscope",
     "Objective",
+    "Plan",
     "Polarisation",
     "Prism",
     "Rays",
     "SamplingWarning",
     "Spectrum",
     "ThinLens",
+    "ToleranceWarning",
     "Volume",
     "image",
     "image_field",
     "launch",
+    "plan",
     "thin_lens",
     "trace",
 ]
