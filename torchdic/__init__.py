@@ -17,6 +17,7 @@ from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import Acquisition, Microscope, SamplingWarning, image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
+from torchdic.precision import Candidate, Trial, work_precision
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace
 from torchdic.volume import Volume
@@ -27,6 +28,7 @@ __all__ = [
     "STANDARD",
     "Acquisition",
     "Camera",
+    "Candidate",
     "Condenser",
     "Fidelity",
     "Grid",
@@ -40,10 +42,12 @@ __all__ = [
     "SamplingWarning",
     "Spectrum",
     "ThinLens",
+    "Trial",
     "Volume",
     "image",
     "image_field",
     "launch",
     "thin_lens",
     "trace",
+    "work_precision",
 ]
