@@ -7,6 +7,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -48,7 +49,7 @@ from torchdic import (
     Volume,
     image,
 )
-from torchdic.precision import converged_fidelity, ladder, trials
+from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
 
@@ -158,13 +159,15 @@ def _work_precision(options: argparse.Namespace) -> None:
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
     candidates = config.candidates or ladder(grid)
-    reference = config.work_precision.reference or converged_fidelity(candidates, grid)
+    reference = converged_fidelities(candidates, grid)
+    if (given := config.work_precision.reference) is not None:
+        reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
     if config.simulation.exact and not hasattr(specimen, "field"):
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     prepare_folder(options.out)
     exact = None
     if hasattr(specimen, "field"):
-        exact = exact_images(specimen, grid, microscope, acquisition, reference).to(options.device)
+        exact = exact_images(specimen, grid, microscope, acquisition, reference["wave"]).to(options.device)
     volume = Volume(grid, specimen.delta(grid, dtype=torch.float32, device=options.device), specimen.background)
     steps = trials(
         volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats

@@ -151,8 +151,8 @@ class WorkPrecisionSection:
 class Config:
     """All sections of a configuration file.
 
-    fidelity: None leaves it to the command. specimen: left to `data_synthetic`, which knows its kinds. candidates: whose
-    work and precision are measured; None is `torchdic.precision.ladder`.
+    fidelity: None leaves it to the command. specimen: left to `data_synthetic`, which knows its kinds. candidates:
+    whose work and precision are measured; None is `torchdic.precision.ladder`.
     """
 
     volume: VolumeSection

@@ -6,7 +6,9 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
+from typing import Literal
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -14,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from torchdic import Fidelity, Trial
+from torchdic.fidelity import Propagation
 from torchdic.files import written_whole
 from torchdic.precision import pareto_front
 
@@ -21,6 +24,10 @@ COLOURS = {"projection": "tab:blue", "rays": "tab:orange", "wave": "tab:green"}
 MARKERS = {"projection": "s", "rays": "^", "wave": "o"}
 # Errors below this, those of the converged answer itself among them, are drawn here.
 LEAST = 1e-7
+# Places of a label in points from its point, near ones first.
+HEIGHTS = (4, -9, 12, -17, 20, -25, 28, -33, 36, -41)
+SIDES: list[tuple[float, Literal["left", "right", "center"]]] = [(5, "left"), (-5, "right"), (0, "center")]
+PLACES = [(dx, dy, align) for dy in HEIGHTS for dx, align in SIDES]
 NUMBERS = [field.name for field in fields(Trial) if field.name not in ("name", "candidate", "failure")]
 
 
@@ -36,13 +43,13 @@ def write_csv(path: Path, trials: Sequence[Trial]) -> None:
             writer.writerow({"name": trial.name, **how, "dtype": trial.candidate.dtype, **found})
 
 
-def write_json(path: Path, trials: Sequence[Trial], reference: Fidelity) -> None:
-    """The trials with all options, the reference, and where they ran."""
+def write_json(path: Path, trials: Sequence[Trial], reference: Mapping[Propagation, Fidelity]) -> None:
+    """The trials with all options, each propagation's reference, and where they ran."""
     found = {
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
         "machine": platform.machine(),
-        "reference": asdict(reference),
+        "reference": {propagation: asdict(fidelity) for propagation, fidelity in reference.items()},
         "trials": [asdict(trial) for trial in trials],
     }
     with written_whole(path) as partial:
@@ -100,7 +107,7 @@ def _draw_panel(ax: Axes, trials: Sequence[Trial], cost: str, error: str) -> Non
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.margins(x=0.22, y=0.12)
-    ax.tick_params(labelsize=7)
+    ax.tick_params(which="both", labelsize=7)
     ax.grid(alpha=0.25)
 
 
@@ -108,11 +115,12 @@ def _keep_apart(ax: Axes) -> None:
     """Move each label to the first place beside its point where it hides no other label, no point and no edge."""
     renderer = ax.figure.canvas.get_renderer()  # pyright: ignore[reportAttributeAccessIssue]
     frame = ax.get_window_extent(renderer)
-    points = [ax.transData.transform(line.get_xydata()[0]) for line in ax.lines if len(line.get_xydata()) == 1]
+    lines = [np.asarray(line.get_xydata()) for line in ax.lines]
+    points = [ax.transData.transform(line[0]) for line in lines if len(line) == 1]
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in points]
     for label in ax.texts:
-        for dx, dy, align in _places():
-            label.set_ha(align)
+        for dx, dy, align in PLACES:
+            label.set_horizontalalignment(align)
             label.set_position((dx, dy))
             box = label.get_window_extent(renderer)
             inside = frame.x0 < box.x0 and box.x1 < frame.x1 and frame.y0 < box.y0 and box.y1 < frame.y1
@@ -121,16 +129,10 @@ def _keep_apart(ax: Axes) -> None:
         taken.append(label.get_window_extent(renderer))
 
 
-def _places() -> list[tuple[float, float, str]]:
-    """Offsets in points, near ones first, right of the point before left of it."""
-    heights = (4, -9, 12, -17, 20, -25, 28, -33, 36, -41)
-    return [(sign * 5, dy, align) for dy in heights for sign, align in ((1, "left"), (-1, "right"), (0, "center"))]
-
-
 def as_table(trials: Sequence[Trial]) -> str:
     """The trials as a Markdown table."""
     lines = [
-        "| candidate | seconds | with gradient | MiB | with gradient | numerical | model | gradient: numerical | model |",
+        "| candidate | s | s, gradient | MiB | MiB, gradient | numerical | model | gradient: numerical | model |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for t in trials:

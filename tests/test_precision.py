@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from data_synthetic import Bead, GaussianBall
-from recon.config import converter
+from recon.cli import main
+from recon.config import converter, dump, load
 from recon.fronts import draw_fronts, write_csv, write_json
 from recon.simulate import exact_images
 from torchdic import (
@@ -29,7 +30,7 @@ from torchdic import (
 )
 from torchdic.precision import (
     FLOOR,
-    converged_fidelity,
+    converged_fidelities,
     gradient_error,
     image_error,
     ladder,
@@ -89,7 +90,9 @@ def test_error_of_the_wave_falls_with_the_order_of_its_steps(smooth_field, order
     grid = Grid((6, 22, 24), (0.4, 0.6, 0.6))
     column = Volume(grid, smooth_field(grid, 0.02)[2:3].expand(grid.shape).clone(), N0)
     candidates = [Fidelity("wave", n, order=order) for n in steps]
-    found = work_precision(column, Microscope(0.546), ACQUISITION, candidates, Fidelity("wave", 8 * steps[-1]), repeats=1)
+    found = work_precision(
+        column, Microscope(0.546), ACQUISITION, candidates, Fidelity("wave", 8 * steps[-1]), repeats=1
+    )
     for kind in ("numerical_error", "numerical_gradient_error"):
         errors = [getattr(trial, kind) for trial in found]
         slopes = [math.log2(a / b) for a, b in itertools.pairwise(errors)]
@@ -100,7 +103,9 @@ def test_error_of_the_wave_falls_with_the_order_of_its_steps(smooth_field, order
 def test_float32_has_a_floor_that_float64_has_not(volume):
     """The same numbers in float32: off by rounding, some 1e-7 a transform, over a contrast of about 0.1."""
     fidelity = Fidelity("wave", sources=5)
-    single, double = measured(volume, Candidate(fidelity, "float32"), Candidate(fidelity, "float64"), reference=fidelity)
+    single, double = measured(
+        volume, Candidate(fidelity, "float32"), Candidate(fidelity, "float64"), reference=fidelity
+    )
     assert double.numerical_error == 0
     for error in (single.numerical_error, single.numerical_gradient_error):
         assert 1e-8 < error < 1e-4
@@ -241,8 +246,8 @@ def test_ladder_climbs_from_projection_to_a_careful_wave_and_names_its_rungs():
     assert {rung.fidelity.propagation for rung in rungs} == {"projection", "rays", "wave"}
     assert {rung.dtype for rung in rungs} == {None, "float64"}
     assert len({rung.label for rung in rungs}) == len(rungs)
-    best = converged_fidelity(rungs, GRID)
     for fidelity in (rung.fidelity for rung in rungs):
+        best = converged_fidelities(rungs, GRID)[fidelity.propagation]
         assert best.steps >= 2 * (fidelity.steps or 6)
         assert best.sources > fidelity.sources
         assert best.padding >= fidelity.padding
@@ -257,7 +262,7 @@ def test_label_says_what_is_not_a_default():
 
 @pytest.fixture
 def some_trials():
-    mine = Candidate(Fidelity("wave", sources=3), "float32", "a, \"b\"")
+    mine = Candidate(Fidelity("wave", sources=3), "float32", 'a, "b"')
     return [
         Trial("mine", mine, 0.1, 0.3, 1000, 3000, 1e-3, 2e-3, 1e-2, 0.1),
         Trial("other", Candidate(Fidelity("projection")), 1 / 3, 1.0, 1, 2, 0.0, 0.3, 1e-5, 1.0),
@@ -266,10 +271,10 @@ def some_trials():
 
 
 def test_json_brings_the_trials_back(some_trials, tmp_path):
-    write_json(tmp_path / "t.json", some_trials, Fidelity("wave", sources=60))
+    write_json(tmp_path / "t.json", some_trials, {"wave": Fidelity("wave", sources=60)})
     found = json.loads((tmp_path / "t.json").read_text(encoding="utf-8"))
     assert [converter.structure(trial, Trial) for trial in found["trials"]] == some_trials
-    assert found["reference"]["sources"] == 60
+    assert found["reference"]["wave"]["sources"] == 60
     assert found["torch"] == torch.__version__
 
 
@@ -295,6 +300,103 @@ def test_figure_names_the_front_and_only_it(some_trials):
     assert "beaten" not in {text.get_text() for axes in figure.axes for text in axes.texts}
 
 
+# --- the command ------------------------------------------------------------------------------------------------------
+
+CONFIG = """
+[volume]
+shape = [4, 14, 12]
+spacing = [0.5, 0.25, 0.25]
+background = 1.5
+[microscope]
+wavelength = 0.546
+objective = { na = 0.6 }
+condenser = { na = 0.3 }
+[acquisition]
+prisms = [{ shear = [0.0, 0.24], bias = 1.5 }]
+[specimen]
+kind = "bead"
+radius = 0.6
+contrast = 0.02
+[work_precision]
+repeats = 1
+[work_precision.reference]
+sources = 6
+steps = 8
+[[candidates]]
+fidelity = { propagation = "projection", sources = 2 }
+[[candidates]]
+name = "best"
+dtype = "float64"
+fidelity = { sources = 6, steps = 8 }
+"""
+
+
+@pytest.fixture
+def run(tmp_path, capfd):
+    """A function that runs the command on a configuration: its exit code, and the lines on stderr."""
+
+    def call(text):
+        path = tmp_path / "config.toml"
+        path.write_text(text, encoding="utf-8")
+        code = main(["work-precision", str(path), "--out", str(tmp_path / "out"), "--device", "cpu"])
+        return code, capfd.readouterr().err.splitlines()
+
+    return call
+
+
+def test_command_leaves_csv_json_and_a_figure(run, tmp_path):
+    code, _ = run(CONFIG)
+    assert code == 0
+    out = tmp_path / "out"
+    assert sorted(path.name for path in out.iterdir()) == [f"work_precision.{kind}" for kind in ("csv", "json", "png")]
+    found = json.loads((out / "work_precision.json").read_text(encoding="utf-8"))
+    straight, best = (converter.structure(trial, Trial) for trial in found["trials"])
+    assert (straight.name, best.name) == ("projection 2", "best")
+    assert best.numerical_error == best.numerical_gradient_error == best.model_gradient_error == 0
+    # a bead has an exact field, which is the truth
+    assert 1e-3 < best.model_error < straight.model_error
+    assert found["reference"]["projection"]["steps"] == 8
+    assert (out / "work_precision.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('dtype = "float64"', 'dtype = "float16"', "candidates[1]: dtype 'float16' must be one of"),
+        ('dtype = "float64"', "digits = 3", "unknown key candidates[1].digits"),
+        ("repeats = 1", "repeats = 0", "work_precision: repeats 0 must be at least 1"),
+        ("sources = 2 }", "sources = 0 }", "candidates[0].fidelity: sources 0 must be at least 1"),
+        (
+            "radius = 0.6",
+            "radius = 0.6\nbackground = 1.4",
+            "specimen.background 1.4 differs from volume.background 1.5",
+        ),
+        (CONFIG[CONFIG.index("[specimen]") : CONFIG.index("[work_precision]")], "", "missing key specimen"),
+        (CONFIG[CONFIG.index("[[candidates]]") :], "", None),
+    ],
+)
+def test_bad_configuration_is_one_line(run, tmp_path, old, new, message):
+    text = CONFIG.replace(old, new)
+    if message is None:
+        text, message = "candidates = []\n" + text, "candidates must hold at least one"
+    code, lines = run(text)
+    assert code == 2
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_candidates_and_reference_survive_the_dump(tmp_path):
+    path, again = tmp_path / "a.toml", tmp_path / "b.toml"
+    path.write_text(CONFIG, encoding="utf-8")
+    config = load(path)
+    again.write_text(dump(config), encoding="utf-8")
+    assert list(load(again).candidates) == list(config.candidates)
+    assert load(again).work_precision == config.work_precision
+    assert config.candidates[1] == Candidate(Fidelity("wave", 8, 6), "float64", "best")
+    assert config.work_precision.reference == Fidelity("wave", 8, 6)
+
+
 # --- errors in one line -----------------------------------------------------------------------------------------------
 
 
@@ -306,5 +408,7 @@ def test_errors_state_the_value_and_the_law(volume):
         work_precision(volume, SCOPE, ACQUISITION, [fidelity], fidelity, repeats=0)
     with pytest.raises(ValueError, match=r"exact images have shape \(1, 1, 2, 2\), the model's \(2, 2, 22, 24\)"):
         measured(volume, fidelity, reference=fidelity, exact=torch.zeros(1, 1, 2, 2))
+    with pytest.raises(ValueError, match="reference has none for propagation 'rays', only for wave"):
+        measured(volume, Fidelity("rays"), reference={"wave": fidelity})
     with pytest.raises(ValueError, match="dtype 'float16' must be one of 'float32', 'float64'"):
         Candidate(fidelity, "float16")

@@ -91,6 +91,6 @@ class Fidelity:
             raise ValueError(f"memory {self.memory} must be above 0 bytes")
 
 
-DRAFT = Fidelity("projection", sources=12)
+DRAFT = Fidelity("wave", sources=12, order=1)
 STANDARD = Fidelity("wave")
 REFERENCE = Fidelity("wave", sources=120, interpolation="cubic")

@@ -12,7 +12,7 @@ Voxels are taken as they are: what finer ones would change is part of the model'
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from statistics import median
 from typing import TypeVar
@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from torchdic.fidelity import Fidelity
+from torchdic.fidelity import Fidelity, Propagation
 from torchdic.grid import Grid
 from torchdic.microscope import Acquisition, Microscope, image
 from torchdic.rays import TurnedRaysError
@@ -90,7 +90,7 @@ def work_precision(
     microscope: Microscope,
     acquisition: Acquisition,
     candidates: Sequence[Candidate | Fidelity],
-    reference: Candidate | Fidelity,
+    reference: Candidate | Fidelity | Mapping[Propagation, Candidate | Fidelity],
     *,
     exact: Float[Tensor, "prism focus y x"] | None = None,
     repeats: int = 3,
@@ -98,9 +98,11 @@ def work_precision(
     """A trial of each candidate on a scene, in their order.
 
     reference: how to compute what counts as converged; float64 unless it is a Candidate that says otherwise. Its
-    propagation doesn't matter: each candidate's own is computed with the reference's numbers. exact: images of an exact
-    field, the truth for `model_error`. repeats: timed runs, after those that measure bytes and warm up.
-    Raises ValueError for no candidates, repeats below 1 and exact images of another shape.
+    propagation doesn't matter: each candidate's own is computed with the reference's numbers. Or one for each
+    propagation, the wave among them. exact: images of an exact field, the truth for `model_error`. repeats: timed runs,
+    after those that measure bytes and warm up.
+    Raises ValueError for no candidates, repeats below 1, a propagation without a reference and exact images of another
+    shape.
     """
     return list(trials(volume, microscope, acquisition, candidates, reference, exact=exact, repeats=repeats))
 
@@ -110,7 +112,7 @@ def trials(
     microscope: Microscope,
     acquisition: Acquisition,
     candidates: Sequence[Candidate | Fidelity],
-    reference: Candidate | Fidelity,
+    reference: Candidate | Fidelity | Mapping[Propagation, Candidate | Fidelity],
     *,
     exact: Float[Tensor, "prism focus y x"] | None = None,
     repeats: int = 3,
@@ -121,7 +123,11 @@ def trials(
     if repeats < 1:
         raise ValueError(f"repeats {repeats} must be at least 1")
     scene = _Scene(volume, microscope, acquisition)
-    best = reference if isinstance(reference, Candidate) else Candidate(reference, "float64")
+    given = [c if isinstance(c, Candidate) else Candidate(c) for c in candidates]
+    needed = {"wave", *(candidate.fidelity.propagation for candidate in given)}
+    references = reference if isinstance(reference, Mapping) else dict.fromkeys(needed, reference)
+    if missing := needed - set(references):
+        raise ValueError(f"reference has none for propagation {min(missing)!r}, only for {', '.join(references)}")
     known: dict[tuple, _Answer | None] = {}
 
     def converged(fidelity: Fidelity) -> _Answer | None:
@@ -129,6 +135,8 @@ def trials(
         model = {name: getattr(fidelity, name) for name in MODEL}
         key = tuple(model.values())
         if key not in known:
+            best = references[fidelity.propagation]
+            best = best if isinstance(best, Candidate) else Candidate(best, "float64")
             try:
                 known[key] = scene.answer(replace(best, fidelity=replace(best.fidelity, **model)))
             except TurnedRaysError:
@@ -140,8 +148,7 @@ def trials(
     truth = wave.images if exact is None else exact.to(wave.images)
     if truth.shape != wave.images.shape:
         raise ValueError(f"exact images have shape {tuple(truth.shape)}, the model's {tuple(wave.images.shape)}")
-    for given in candidates:
-        candidate = given if isinstance(given, Candidate) else Candidate(given)
+    for candidate in given:
         try:
             yield _trial(scene, candidate, converged(candidate.fidelity), wave, truth, repeats)
         except TurnedRaysError as error:
@@ -194,35 +201,42 @@ def pareto_front(costs: Sequence[float | None], errors: Sequence[float | None]) 
 
 def ladder(grid: Grid) -> list[Candidate]:
     """Candidates from the cheapest way to the most careful one, for a volume of so many slices."""
-    slices = grid.shape[0]
-    side = max(grid.shape[1:]) // 4
+    slices, margin = grid.shape[0], max(grid.shape[1:]) // 8
     return [
         Candidate(Fidelity("projection", sources=12)),
-        Candidate(Fidelity("projection", sources=40)),
+        Candidate(Fidelity("projection")),
         Candidate(Fidelity("rays", sources=12, steps=max(1, slices // 4))),
-        Candidate(Fidelity("rays", sources=40, steps=max(1, slices // 2), interpolation="cubic")),
+        Candidate(Fidelity("rays", sources=24, steps=max(1, slices // 4), interpolation="cubic")),
         Candidate(Fidelity("wave", sources=12, steps=max(1, slices // 4))),
         Candidate(Fidelity("wave", sources=12, order=1)),
         Candidate(Fidelity("wave", sources=12)),
         Candidate(Fidelity("wave", sources=24)),
-        Candidate(Fidelity("wave", sources=40, steps=max(1, slices // 2))),
-        Candidate(Fidelity("wave", sources=40)),
-        Candidate(Fidelity("wave", sources=40, padding=side)),
-        Candidate(Fidelity("wave", sources=40, steps=2 * slices)),
-        Candidate(Fidelity("wave", sources=80, steps=2 * slices, padding=side)),
-        Candidate(Fidelity("wave", sources=40), "float64"),
+        Candidate(Fidelity("wave", steps=max(1, slices // 2))),
+        Candidate(Fidelity("wave")),
+        Candidate(Fidelity("wave"), "float64"),
+        Candidate(Fidelity("wave", padding=margin)),
+        Candidate(Fidelity("wave", steps=2 * slices)),
+        Candidate(Fidelity("wave", sources=80)),
+        Candidate(Fidelity("wave", steps=2 * slices, sources=80, padding=margin)),
     ]
 
 
-def converged_fidelity(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> Fidelity:
-    """Numbers finer than every candidate's: twice its steps, half as many sources again, its padding, cubic splines.
+def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> dict[Propagation, Fidelity]:
+    """For each propagation numbers finer than its candidates': twice the steps, half as many sources again, splines.
 
-    The wave's error at half the steps is then 4/3 of what the trial shows, for it falls with their square.
+    The padding is that of all candidates' widest. The wave's error at half the reference's steps is 4/3 of what a trial
+    shows, for it falls with their square.
     """
     given = [c.fidelity if isinstance(c, Candidate) else c for c in candidates]
-    steps = 2 * max(f.steps or grid.shape[0] for f in given)
-    sources = -(-3 * max(f.sources for f in given) // 2)
-    return Fidelity("wave", steps, sources, "cubic", padding=max(f.padding for f in given))
+    found: dict[Propagation, Fidelity] = {}
+    used: list[Propagation] = ["wave", *(f.propagation for f in given)]
+    for propagation in dict.fromkeys(used):
+        own = [f for f in given if f.propagation == propagation] or given
+        steps = 2 * max(f.steps or grid.shape[0] for f in own)
+        sources = -(-3 * max(f.sources for f in own) // 2)
+        margin = max(f.padding for f in given)
+        found[propagation] = Fidelity(propagation, steps, sources, "cubic", padding=margin)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +334,7 @@ def peak_bytes(run: Callable[[], T], device: torch.device | str = "cpu") -> tupl
     events = [event for event in recorded.kineto_results.events() if event.name() == "[memory]"]
     held, most = 0, 0
     for event in sorted(events, key=lambda event: event.start_ns()):
-        held += event.nbytes()
+        held += event.nbytes()  # pyright: ignore[reportAttributeAccessIssue]
         most = max(most, held)
     return result, most
 
