@@ -49,6 +49,7 @@ from torchdic import (
     Volume,
     image,
 )
+from torchdic.fidelity import Propagation
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
@@ -159,7 +160,7 @@ def _work_precision(options: argparse.Namespace) -> None:
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
     candidates = config.candidates or ladder(grid)
-    reference = converged_fidelities(candidates, grid)
+    reference: dict[Propagation, Fidelity] = converged_fidelities(candidates, grid)
     if (given := config.work_precision.reference) is not None:
         reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
     if config.simulation.exact and not hasattr(specimen, "field"):

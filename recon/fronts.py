@@ -27,7 +27,9 @@ LEAST = 1e-7
 # Places of a label in points from its point, near ones first.
 HEIGHTS = (4, -9, 12, -17, 20, -25, 28, -33, 36, -41)
 SIDES: list[tuple[float, Literal["left", "right", "center"]]] = [(5, "left"), (-5, "right"), (0, "center")]
-PLACES = [(dx, dy, align) for dy in HEIGHTS for dx, align in SIDES]
+PLACES: list[tuple[float, float, Literal["left", "right", "center"]]] = [
+    (dx, dy, align) for dy in HEIGHTS for dx, align in SIDES
+]
 NUMBERS = [field.name for field in fields(Trial) if field.name not in ("name", "candidate", "failure")]
 
 

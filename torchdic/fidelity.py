@@ -93,4 +93,4 @@ class Fidelity:
 
 DRAFT = Fidelity("wave", sources=12, order=1)
 STANDARD = Fidelity("wave")
-REFERENCE = Fidelity("wave", sources=120, interpolation="cubic")
+REFERENCE = Fidelity("wave", sources=120, interpolation="cubic", padding=16)

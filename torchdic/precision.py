@@ -206,7 +206,7 @@ def ladder(grid: Grid) -> list[Candidate]:
         Candidate(Fidelity("projection", sources=12)),
         Candidate(Fidelity("projection")),
         Candidate(Fidelity("rays", sources=12, steps=max(1, slices // 4))),
-        Candidate(Fidelity("rays", sources=24, steps=max(1, slices // 4), interpolation="cubic")),
+        Candidate(Fidelity("rays", sources=24, steps=max(1, slices // 4))),
         Candidate(Fidelity("wave", sources=12, steps=max(1, slices // 4))),
         Candidate(Fidelity("wave", sources=12, order=1)),
         Candidate(Fidelity("wave", sources=12)),
