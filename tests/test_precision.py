@@ -1,10 +1,13 @@
 """Work and precision: errors are those of known answers, costs are counted, fronts hold no beaten point."""
 
 import csv
+import importlib
 import itertools
 import json
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -298,6 +301,40 @@ def test_figure_names_the_front_and_only_it(some_trials):
     beaten = replace(beaten, model_error=1.0, numerical_gradient_error=1.0, model_gradient_error=1.0)
     figure = draw_fronts({"scene": [*some_trials, beaten]})
     assert "beaten" not in {text.get_text() for axes in figure.axes for text in axes.texts}
+
+
+# --- the presets ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+        yield importlib.import_module("accuracy")
+        patch.delitem(sys.modules, "accuracy")
+
+
+@pytest.mark.parametrize(("preset", "error"), [("DRAFT", 0.037), ("STANDARD", 0.019), ("REFERENCE", 0.018)])
+def test_preset_errs_on_the_thin_weak_bead_by_what_it_says(benchmark, preset, error):
+    """Within a fifth of the table of docs/accuracy.md, either way."""
+    scene = benchmark.SCENES["thin weak bead"]
+    parts = benchmark.MICROSCOPE, scene.acquisition
+    exact = exact_images(scene.specimen, scene.grid, *parts, Fidelity(sources=150))
+    with torch.no_grad():
+        found = image_error(image(scene.volume(), *parts, benchmark.PRESETS[preset]), exact)
+    assert error / 1.2 < found < 1.2 * error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "error"), [("DRAFT", 0.20), ("STANDARD", 0.083)])
+def test_preset_errs_on_the_cell_by_what_it_says(benchmark, preset, error):
+    """Within a fifth of the table of docs/accuracy.md, either way; the truth is the wave, padded and in thin slabs."""
+    scene = benchmark.SCENES["cell"]
+    parts = benchmark.MICROSCOPE, scene.acquisition
+    with torch.no_grad():
+        truth = image(scene.volume(), *parts, Fidelity("wave", 32, 150, padding=16))
+        found = image_error(image(scene.volume(), *parts, benchmark.PRESETS[preset]), truth)
+    assert error / 1.2 < found < 1.2 * error
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
