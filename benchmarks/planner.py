@@ -29,7 +29,8 @@ from torchdic import (
     image,
     plan,
 )
-from torchdic.plan import describe, image_error
+from torchdic.image_error import image_error
+from torchdic.plan import describe
 
 GRID = Grid((20, 96, 96), (0.4, 0.2, 0.2))
 MICROSCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))

@@ -1,4 +1,4 @@
-"""The command line: torchdic demo | simulate | plan | reconstruct."""
+"""The command line: torchdic demo | simulate | plan | reconstruct | work-precision."""
 
 import argparse
 import json
@@ -34,6 +34,7 @@ from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
 from recon.config import Config, ConfigError, dump, load, structure
 from recon.descend import Recipe
+from recon.fronts import as_table, draw_fronts, write_csv, write_json
 from recon.planned import announce
 from recon.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
 from recon.simulate import exact_images
@@ -52,7 +53,9 @@ from torchdic import (
     image,
     plan,
 )
+from torchdic.fidelity import Propagation
 from torchdic.files import written_whole
+from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
 from torchdic.wave import UnstableError
@@ -129,7 +132,6 @@ def _simulate(options: argparse.Namespace) -> None:
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
     fidelity = config.fidelity or STANDARD
-    _check_background(specimen, config, options.config)
     if config.simulation.exact and config.tolerance is not None:
         raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
     if config.simulation.exact and not hasattr(specimen, "field"):
@@ -165,7 +167,6 @@ def _simulate(options: argparse.Namespace) -> None:
 def _plan(options: argparse.Namespace) -> None:
     config = load(options.config)
     specimen = _specimen(config, str(options.config))
-    _check_background(specimen, config, options.config)
     tolerance = USUAL_TOLERANCE if config.tolerance is None else config.tolerance
     if options.out is not None:
         prepare_folder(options.out)
@@ -175,14 +176,6 @@ def _plan(options: argparse.Namespace) -> None:
     print(planned.table())
     if options.out is not None:
         _write_json(options.out / "plan.json", planned.as_dict())
-
-
-def _check_background(specimen: Any, config: Config, source: Path) -> None:
-    if specimen.background != config.volume.background:
-        raise ConfigError(
-            f"{source}: specimen.background {specimen.background} differs from volume.background "
-            f"{config.volume.background}"
-        )
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
@@ -203,6 +196,32 @@ def _reconstruct(options: argparse.Namespace) -> None:
     )
 
 
+def _work_precision(options: argparse.Namespace) -> None:
+    config = load(options.config)
+    specimen = _specimen(config, str(options.config))
+    grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
+    candidates = config.candidates or ladder(grid)
+    reference: dict[Propagation, Fidelity] = converged_fidelities(candidates, grid)
+    if (given := config.work_precision.reference) is not None:
+        reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
+    if config.simulation.exact and not hasattr(specimen, "field"):
+        raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
+    prepare_folder(options.out)
+    exact = None
+    if hasattr(specimen, "field"):
+        exact = exact_images(specimen, grid, microscope, acquisition, reference["wave"]).to(options.device)
+    volume = Volume(grid, specimen.delta(grid, dtype=torch.float32, device=options.device), specimen.background)
+    steps = trials(
+        volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats
+    )
+    found = list(tqdm(steps, desc="work-precision", total=len(candidates), unit="candidate"))
+    write_csv(options.out / "work_precision.csv", found)
+    write_json(options.out / "work_precision.json", found, reference)
+    figures.save(draw_fronts({str((config.specimen or {})["kind"]): found}), options.out / "work_precision.png")
+    print(as_table(found))
+    print(f"\n{options.out / 'work_precision.csv'}, .json and .png: {len(found)} candidates")
+
+
 def _specimen(config: Config, source: str) -> Any:
     if config.specimen is None:
         raise ConfigError(f"{source}: missing key specimen: a simulation or plan needs one")
@@ -211,7 +230,13 @@ def _specimen(config: Config, source: str) -> Any:
     if not isinstance(kind, str) or kind not in SPECIMENS:
         raise ConfigError(f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}")
     values.setdefault("background", config.volume.background)
-    return structure(values, SPECIMENS[kind], source, "specimen")
+    specimen = structure(values, SPECIMENS[kind], source, "specimen")
+    if specimen.background != config.volume.background:
+        raise ConfigError(
+            f"{source}: specimen.background {specimen.background} differs from volume.background "
+            f"{config.volume.background}"
+        )
+    return specimen
 
 
 def _equal_step(focus: Sequence[float]) -> float | None:
@@ -262,6 +287,10 @@ def _parser() -> argparse.ArgumentParser:
     again.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR, if there is one")
     again.add_argument("--restart", action="store_true", help="begin anew in spite of an interrupted run in DIR")
     fit.set_defaults(command=_reconstruct)
+    cost = commands.add_parser(
+        "work-precision", parents=[config, out, device], help="what accuracy costs: error against seconds and bytes"
+    )
+    cost.set_defaults(command=_work_precision)
     return parser
 
 

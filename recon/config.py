@@ -8,7 +8,7 @@ import difflib
 import math
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
@@ -25,6 +25,7 @@ from torch import Tensor
 from recon.descend import Recipe
 from torchdic import (
     Acquisition,
+    Candidate,
     Condenser,
     Fidelity,
     Grid,
@@ -131,12 +132,28 @@ class SimulationSection:
     exact: bool = False
 
 
+@dataclass(frozen=True)
+class WorkPrecisionSection:
+    """How to measure work and precision.
+
+    repeats: timed runs. reference: what counts as converged; None is finer than every candidate.
+    """
+
+    repeats: int = 3
+    reference: Fidelity | None = None
+
+    def __post_init__(self) -> None:
+        if self.repeats < 1:
+            raise ValueError(f"repeats {self.repeats} must be at least 1")
+
+
 @dataclass(frozen=True, eq=False)
 class Config:
     """All sections of a configuration file.
 
     fidelity: None leaves it to the command. tolerance: of the images, for which a fidelity is planned, see
-    `torchdic.plan`; the two exclude each other. specimen: left to `data_synthetic`, which knows its kinds.
+    `torchdic.plan`; the two exclude each other. specimen: left to `data_synthetic`, which knows its kinds. candidates:
+    whose work and precision are measured; None is `torchdic.precision.ladder`.
     """
 
     volume: VolumeSection
@@ -148,6 +165,8 @@ class Config:
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None
     tolerance: float | None = None
+    candidates: Sequence[Candidate] | None = None
+    work_precision: WorkPrecisionSection = field(default_factory=WorkPrecisionSection)
 
     def __post_init__(self) -> None:
         if self.tolerance is not None:
@@ -156,6 +175,8 @@ class Config:
             if not (0 < self.tolerance < math.inf):
                 raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
         check_apertures(self.microscope, self.volume.background)
+        if self.candidates is not None and len(self.candidates) == 0:
+            raise ValueError("candidates must hold at least one; leave it out for the default ones")
 
 
 def load(path: str | os.PathLike[str]) -> Config:
@@ -301,6 +322,10 @@ def _pauli_zernike(value: Any, _: Any) -> dict[int, tuple[float, float]]:
     return {int(key): _tuple(pair, tuple[float, float]) for key, pair in value.items()}
 
 
+def _candidate(value: Any, _: Any) -> Candidate:
+    return converter.structure(value, Candidate)
+
+
 def _aberrations(value: Any, _: Any) -> dict[int, float]:
     if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
         raise TypeError(f"{value!r} must be a table of Noll indices, each with its phase in rad")
@@ -377,5 +402,6 @@ _hooks: dict[type, dict[str, Callable[[Any, Any], Any]]] = {
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _sequence_of(_number)),
     Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},
     DataSection: {"scale": _scale},
+    Config: {"candidates": _sequence_of(_candidate)},
 }
 converter.register_structure_hook_factory(dataclasses.is_dataclass, _table)

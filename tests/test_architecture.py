@@ -37,6 +37,7 @@ LAYERS = (
     "imaging",
     "microscope",
     "weak",
+    "image_error",
     "plan",
     "precision",
     "tiff",

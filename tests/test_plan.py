@@ -32,7 +32,8 @@ from torchdic import (
     image,
     plan,
 )
-from torchdic.plan import FLOOR, describe, image_error, work
+from torchdic.image_error import FLOOR, image_error
+from torchdic.plan import describe, work
 from torchdic.tiff import read_volume
 
 GRID = Grid((16, 48, 48), (0.4, 0.2, 0.2))

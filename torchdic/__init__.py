@@ -19,6 +19,7 @@ from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.plan import Effect, Plan, ToleranceWarning, plan
+from torchdic.precision import Candidate, Trial, work_precision
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace
 from torchdic.volume import Volume
@@ -29,6 +30,7 @@ __all__ = [
     "STANDARD",
     "Acquisition",
     "Camera",
+    "Candidate",
     "Condenser",
     "Effect",
     "Fidelity",
@@ -45,6 +47,7 @@ __all__ = [
     "Spectrum",
     "ThinLens",
     "ToleranceWarning",
+    "Trial",
     "Volume",
     "image",
     "image_field",
@@ -52,4 +55,5 @@ __all__ = [
     "plan",
     "thin_lens",
     "trace",
+    "work_precision",
 ]

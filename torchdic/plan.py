@@ -22,19 +22,16 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.condenser import Condenser
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
+from torchdic.image_error import relative
 from torchdic.microscope import Acquisition, Microscope, SamplingWarning, check_apertures, image
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
 
-# Least standard deviation, in units of the empty bright field, that an image's error is compared with: the shot noise
-# of a million electrons, below any camera's. It gives an empty scene's error a meaning.
-FLOOR = 1e-3
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
 MARGIN = 0.6
 # Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be.
@@ -77,7 +74,7 @@ class Effect:
 class Plan:
     """The cheapest fidelity that meets a tolerance, with what it is expected to give.
 
-    error: predicted, as `image_error` defines it. seconds: of one `image` without gradients, predicted. met: whether
+    error: predicted, as `torchdic.image_error` defines it. seconds: of one `image` without gradients, predicted. met: whether
     the tolerance is. planning: seconds that the plan took.
     """
 
@@ -123,19 +120,9 @@ def describe(fidelity: Fidelity) -> str:
     return ", ".join([*parts, f"{fidelity.sources} sources"]) + sides
 
 
-def image_error(images: Float[Tensor, "prism focus y x"], truth: Float[Tensor, "prism focus y x"]) -> float:
-    """The largest over the images of rms difference over the true image's standard deviation (at least FLOOR)."""
-    return _relative(images - truth, truth)
-
-
-def _relative(difference: Tensor, truth: Tensor) -> float:
-    contrast = truth.std((2, 3), correction=0).clamp_min(FLOOR)
-    return float((difference.square().mean((2, 3)).sqrt() / contrast).max())
-
-
 @torch.no_grad()
 def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
-    """The cheapest Fidelity whose images err by at most `tolerance` (see `image_error`), and what each effect is worth.
+    """The cheapest Fidelity whose images err by at most `tolerance` (see `torchdic.image_error`), and what each effect is worth.
 
     Where the specimen stays clear of the sides the truth is the specimen alone in its medium; where it reaches them,
     the periodic array that `image` computes without padding. Nothing in it is random, and no choice hangs on a clock.
@@ -209,7 +196,7 @@ def _plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tole
     sides = _sides(volume, microscope, pilot.acquisition)
 
     def total(way: _Choice, count: _Choice, side: tuple[int, float]) -> float:
-        return math.hypot(_relative(way.lacks + count.lacks, truth), count.beyond, side[1])
+        return math.hypot(relative(way.lacks + count.lacks, truth), count.beyond, side[1])
 
     def joined(way: _Choice, count: _Choice, side: tuple[int, float]) -> Fidelity:
         return replace(way.fidelity, sources=count.fidelity.sources, padding=side[0])
@@ -248,11 +235,11 @@ def _sources(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
         if count < 18 or len(seen) < 3:
             continue  # fewer may agree by chance
         (_, before), (_, previous), (_, last) = seen[-3:]
-        still = _relative(last - previous, last)
+        still = relative(last - previous, last)
         # behind a sharp pupil the error falls as 1/K at worst; a geometric fall shows in three numbers above a few
         left = min(1 / (count / seen[-2][0].sources - 1), 1.0)
         if seen[-3][0].sources > 1:
-            fall = min(still / max(_relative(previous - before, last), 1e-300), 0.9)
+            fall = min(still / max(relative(previous - before, last), 1e-300), 0.9)
             left = min(left, max(fall / (1 - fall), 0.1))
         beyond = left * still
         if beyond <= MARGIN / 2 * tolerance:
@@ -264,7 +251,7 @@ def _fewer(pilot: _Pilot, counts: Sequence[_Choice], dense: Tensor, tolerance: f
     """The pilot with as few sources as tell its ways of crossing the specimen apart."""
     wanted = 18
     if counts:
-        enough = (c.fidelity.sources for c in counts if _relative(c.lacks, dense) <= 0.1)
+        enough = (c.fidelity.sources for c in counts if relative(c.lacks, dense) <= 0.1)
         wanted = min(max(next(enough, 18), 8), 18)
     return _lit(pilot, wanted)
 
@@ -295,9 +282,9 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
     ladder = [-(-fine // 2), fine, 2 * fine]  # slabs that merge slices tell nothing of those that divide them
     while True:
         coarser, middle, finest = (run(m) for m in ladder[-3:])
-        last = _relative(finest - middle, finest)
+        last = relative(finest - middle, finest)
         # between first order, at edges, and the split step's second
-        ratio = min(max(_relative(middle - coarser, finest) / max(last, 1e-300), 1.5), 4.0)
+        ratio = min(max(relative(middle - coarser, finest) / max(last, 1e-300), 1.5), 4.0)
         if last / (ratio - 1) <= MARGIN / 2 * tolerance or ladder[-1] >= 8 * slices:
             break
         ladder.append(2 * ladder[-1])
@@ -308,7 +295,7 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
         steps = ladder[-1]
         while steps >= 1:
             ways.append(_Choice(Fidelity("wave", steps=steps, order=1 if order == 1 else 2), run(steps, order) - truth))
-            if steps == 1 or _relative(ways[-1].lacks, truth) > 4 * tolerance:
+            if steps == 1 or relative(ways[-1].lacks, truth) > 4 * tolerance:
                 break
             steps = -(-steps // 2)
     return ways, truth
@@ -323,7 +310,7 @@ def _sides(volume: Volume, microscope: Microscope, acquisition: Acquisition) -> 
     whole = _lit(_Pilot(volume, microscope, acquisition), 32)
     widths = sorted({0, -(-width // 4), -(-width // 2), width})
     images = [whole(replace(whole.coarse, padding=w)) for w in widths]
-    errors = [_relative(i - images[-1], images[-1]) for i in images]
+    errors = [relative(i - images[-1], images[-1]) for i in images]
     left = errors[-2] / 3  # the blur's tail falls off slowly: so much lies beyond the widest
     return [(w, e + left) for w, e in zip(widths, errors, strict=True)]
 
@@ -401,7 +388,7 @@ def _effects(
     def absent(name: str) -> Effect:
         return Effect(name, False, 0.0, 0.0, "absent")
 
-    straight = _relative(ways[0].lacks, truth)
+    straight = relative(ways[0].lacks, truth)
     projected = saved(work(replace(fidelity, propagation="projection"), volume, microscope, acquisition))
     effects = [effect(*row, basis=basis) for row, basis in _ladder(few, straight, tolerance)]
     effects[0] = replace(effects[0], cost=projected)
@@ -413,14 +400,14 @@ def _effects(
     else:
         alone = work(replace(fidelity, sources=counts[0].fidelity.sources), volume, microscope, acquisition)
         note = f"{counts[0].fidelity.sources} source in place of {K}"
-        effects.append(effect("partial coherence", _relative(counts[0].lacks, truth), note, saved(alone)))
+        effects.append(effect("partial coherence", relative(counts[0].lacks, truth), note, saved(alone)))
 
     base = few(few.coarse)
     single = few(replace(few.coarse, steps=1, order=2)) - few(replace(few.coarse, order=2))
     one = work(replace(fidelity, steps=1), volume, microscope, acquisition)
-    effects.append(effect("steps", _relative(single, truth), "one slab in place of several", saved(one)))
+    effects.append(effect("steps", relative(single, truth), "one slab in place of several", saved(one)))
     paraxial = few(replace(few.coarse, defocus="paraxial")) - base
-    effects.append(effect("defocus", _relative(paraxial, truth), "paraxial in place of exact"))
+    effects.append(effect("defocus", relative(paraxial, truth), "paraxial in place of exact"))
     if sides[-1][0] > 0:
         unpadded = work(replace(fidelity, padding=0), volume, microscope, acquisition)
         effects.append(effect("sides", sides[0][1], "no padding", saved(unpadded)))
@@ -431,7 +418,7 @@ def _effects(
         if declared is None:
             return absent(name)
         less = saved(work(fidelity, replace_volume(volume, other), other.microscope, acquisition))
-        return effect(name, _relative(other(few.coarse) - base, base), "left out", less)
+        return effect(name, relative(other(few.coarse) - base, base), "left out", less)
 
     def replace_volume(full: Volume, other: _Pilot) -> Volume:
         keeps = other.volume.absorption is not None
@@ -454,7 +441,7 @@ def _effects(
         sharp = replace(few, microscope=replace(few.microscope, camera=None))(few.coarse)
         pixel = camera.pixel_spacing((few.volume.grid.spacing[1], few.volume.grid.spacing[2]))
         blurred = _through_pixels(sharp, few.volume.grid, pixel)
-        effects.append(effect("camera", _relative(blurred - sharp, blurred), "pixels that see no area"))
+        effects.append(effect("camera", relative(blurred - sharp, blurred), "pixels that see no area"))
     return tuple(effects)
 
 
@@ -487,14 +474,14 @@ def _ladder(few: _Pilot, straight: float, tolerance: float) -> list[tuple[tuple[
         return [((name, straight, f"{whole}; {why}"), "bound") for name in names]
     wave = small(Fidelity("wave"))
     rows = [
-        (("bending", _relative(bent - projected, wave), "bent rays against straight ones"), "pilot"),
-        (("amplitude", _relative(carried - bent, wave), "rays with and without it"), "pilot"),
-        (("diffraction", _relative(wave - carried, wave), "the wave against rays"), "pilot"),
+        (("bending", relative(bent - projected, wave), "bent rays against straight ones"), "pilot"),
+        (("amplitude", relative(carried - bent, wave), "rays with and without it"), "pilot"),
+        (("diffraction", relative(wave - carried, wave), "the wave against rays"), "pilot"),
     ]
     try:
         own = small(Fidelity("projection", object_aberration="linear", steps=min(small.slices, 12)))
         note = "in straight rays; the wave has it already"
-        rows.append((("object aberration", _relative(own - projected, wave), note), "pilot"))
+        rows.append((("object aberration", relative(own - projected, wave), note), "pilot"))
     except ValueError:
         rows.append((("object aberration", straight, f"{whole}; the specimen is too strong a lens"), "bound"))
     return rows
