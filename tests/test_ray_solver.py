@@ -1,6 +1,7 @@
 """The hand-written derivatives are those of what was computed: against autograd through torchdiffeq, to rounding."""
 
 import dataclasses
+from unittest import mock
 
 import pytest
 import torch
@@ -92,7 +93,7 @@ def test_gradient_in_everything_is_autograds_through_torchdiffeq(case, solver):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
 
 
-def test_backward_pass_keeps_a_state_per_evaluation_and_nothing_else():
+def test_backward_pass_keeps_where_a_step_began_and_what_it_sampled_and_nothing_else():
     equation, _ = problem(absorbing=True, turn=True)
     depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
     kept = {}
@@ -104,8 +105,9 @@ def test_backward_pass_keeps_a_state_per_evaluation_and_nothing_else():
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         solve(equation, equation.start(), depths, Fidelity("rays"))
     own = {t.untyped_storage().data_ptr() for t in equation.tensors}
-    state = equation.start().untyped_storage().nbytes()
-    assert sum(size for pointer, size in kept.items() if pointer not in own) == 4 * 8 * state
+    value = equation.start()[0].nbytes
+    # δy, δx and their momenta, of 4 stages Δn with its gradient and κ; beside the first W, ∫κ ds and τ
+    assert sum(size for pointer, size in kept.items() if pointer not in own) == (8 * (4 + 4 * 4) + 3) * value
 
 
 def test_nothing_is_kept_where_nothing_is_learned():
@@ -115,6 +117,19 @@ def test_nothing_is_kept_where_nothing_is_learned():
     equation = dataclasses.replace(equation, straight=straight, background=background, index=index)
     depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
     assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+
+
+def test_nothing_is_kept_without_gradients():
+    """Parameters require grad there too."""
+    equation, _ = problem()
+    depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
+    sizes = []
+    with (
+        torch.no_grad(),
+        mock.patch.object(torch.autograd.function.FunctionCtx, "save_for_backward", lambda _, *t: sizes.append(len(t))),
+    ):
+        assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+    assert sizes == [len(equation.tensors)]
 
 
 def test_volume_changed_between_the_passes_is_an_error_not_a_wrong_gradient():
