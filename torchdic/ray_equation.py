@@ -7,7 +7,7 @@ n = n0 + Δn, v = p0/p_z0 and r = 1/p_z the slopes are
     δy' = r (δp_y − v_y q),    δp_y' = r n ∂n/∂y,    W' = r (B + |δp|² + q²)/2,
     ∫κ ds: r n κ,    τ' = r (p_x ∂n/∂y − p_y ∂n/∂x)/(n + p_z).
 
-q = (p_z² − p_z0²)/(p_z + p_z0), whose numerator B − δp·(δp + 2p0) has no cancellation, has the derivative of p_z − p_z0.
+q = (p_z² − p_z0²)/(p_z + p_z0), its numerator B − δp·(δp + 2p0) free of cancellation, differs as p_z − p_z0 does.
 No slope depends on the last three, the sums along the ray.
 """
 
