@@ -37,7 +37,8 @@ class Case:
         self.points = torch.from_numpy(data["source_na_yx"])
         self.na = float((2 * self.points.square().sum(1).mean()).sqrt())
         self.background, self.spacing = float(data["n_medium"]), float(data["spacing"])
-        self.grid = Grid((1, *self.object.shape), (1.0, self.spacing, self.spacing))
+        ny, nx = self.object.shape
+        self.grid = Grid((1, ny, nx), (1.0, self.spacing, self.spacing))
         self.focus = data["focus_paraxial"].tolist()
         shear = data["shear_yx"].tolist()
         self.prism = Prism((shear[0], shear[1]), float(data["bias"]))
@@ -115,7 +116,9 @@ def main() -> None:
     ways: dict[str, Callable] = {
         "NumPy, 437 directions": rival.stack,
         "torchdic, 437 directions": lambda: case.take(square, (case.prism,)),
-        **{f"torchdic, {n} on rings": lambda n=n: case.take(Condenser(case.na), (case.prism,), n) for n in (24, 32, 40)},
+        **{
+            f"torchdic, {n} on rings": lambda n=n: case.take(Condenser(case.na), (case.prism,), n) for n in (24, 32, 40)
+        },
     }
     agreement = np.abs(rival.stack() - case.take(square, (case.prism,))[0].numpy()).max()
     print(f"\nfloat32, {arguments.threads} thread(s); NumPy and torchdic at 437 directions agree to {agreement:.0e}\n")

@@ -81,7 +81,7 @@ class RayEquation:
         slopes = torch.empty_like(met.moving)
         torch.addcmul(met.moving[2:], self.straight[2:4], met.q, value=-1, out=slopes[:2])
         slopes[:2].mul_(met.r)
-        torch.mul(met.index[1:], met.n * met.r, out=slopes[2:])
+        torch.mul(met.sampled[1:], met.n * met.r, out=slopes[2:])
         return slopes
 
     def add_sums(self, sums: Float[Tensor, "sum *ray"], met: "Met", h: float) -> None:
@@ -97,13 +97,13 @@ class RayEquation:
 
         A name that ends in _bar is the loss's derivative in that value.
         """
-        (_, gy, gx), n, pz, r, q = met.index, met.n, met.pz, met.r, met.q
+        (_, gy, gx), n, pz, r, q = met.sampled, met.n, met.pz, met.r, met.q
         dp, v = met.moving[2:], self.straight[2:4]
         learned = self.straight.requires_grad
 
         out = moves_bar * r
         path_bar = torch.mul(sums_bar[0], r).mul_(h)
-        index_bar = torch.empty_like(met.index)
+        index_bar = torch.empty_like(met.sampled)
         n_bar = torch.mul(gy, out[2], out=index_bar[0]).addcmul_(gx, out[3])
         gradient_bar = torch.mul(n, out[2:], out=index_bar[1:])
         # of r, by itself and within p_z: −r² of its own
@@ -159,7 +159,7 @@ class RayEquation:
     def _swept(self, met: "Met") -> Tensor:
         """τ' p_z."""
         p = met.moving[2:] + self.straight[4:6]
-        return (p[1] * met.index[1]).addcmul_(p[0], met.index[2], value=-1).div_(met.n + met.pz)
+        return (p[1] * met.sampled[1]).addcmul_(p[0], met.sampled[2], value=-1).div_(met.n + met.pz)
 
 
 class Met(NamedTuple):
@@ -168,7 +168,7 @@ class Met(NamedTuple):
     # δy, δx, δp_y, δp_x
     moving: Tensor
     # Δn, ∂n/∂y, ∂n/∂x
-    index: Tensor
+    sampled: Tensor
     kappa: Tensor | None
     n: Tensor
     pz: Tensor

@@ -91,7 +91,7 @@ class _EqualSteps(torch.autograd.Function):
                 if weight != 0:
                     equation.add_sums(sums, met, h * weight)
                 if keep:
-                    kept += [met.index] if met.kappa is None else [met.index, met.kappa]
+                    kept += [met.sampled] if met.kappa is None else [met.sampled, met.kappa]
             moving = _advanced(moving, slopes, b, h)
         ctx.settings = equation, depths, solver
         ctx.save_for_backward(*tensors, *kept)
