@@ -10,6 +10,7 @@ from torchdiffeq import odeint
 from torchdic import Fidelity, Grid
 from torchdic.ray_equation import RayEquation
 from torchdic.ray_solver import TABLEAUX, solve
+from torchdic.rays import kept_by_rays
 from torchdic.recompute import recompute
 from torchdic.sampling import SliceSampler, spline_coefficients
 
@@ -108,6 +109,27 @@ def test_backward_pass_keeps_where_a_step_began_and_what_it_sampled_and_nothing_
     value = equation.start()[0].nbytes
     # δy, δx and their momenta, of 4 stages Δn with its gradient and κ; beside the first W, ∫κ ds and τ
     assert sum(size for pointer, size in kept.items() if pointer not in own) == (8 * (4 + 4 * 4) + 3) * value
+
+
+@pytest.mark.parametrize("solver", TABLEAUX)
+@pytest.mark.parametrize("absorbing", [False, True])
+def test_kept_by_rays_is_what_is_kept(solver, absorbing):
+    """The estimate that decides whether slabs are recomputed."""
+    equation, _ = problem(absorbing=absorbing)
+    depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
+    kept = {}
+
+    def keep(tensor):
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    fidelity = Fidelity("rays", solver=solver, steps=8)
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        solve(equation, equation.start(), depths, fidelity)
+    own = {t.untyped_storage().data_ptr() for t in equation.tensors}
+    values = sum(size for pointer, size in kept.items() if pointer not in own) / equation.start()[0].nbytes
+    # the first state is kept with its sums
+    assert values - 1 - absorbing == kept_by_rays(GRID, fidelity, absorbs=absorbing)
 
 
 def test_nothing_is_kept_where_nothing_is_learned():
