@@ -1,6 +1,6 @@
 """The figure of docs/performance.md, drawn from its table of rays.
 
-    python benchmarks/performance_figure.py
+python benchmarks/performance_figure.py
 """
 
 import re
