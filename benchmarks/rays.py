@@ -2,11 +2,13 @@
 
     python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 3] [--ways Torchdic Diffrax ...]
 
-Each way of ray_rivals.py runs in a process of its own, in turn with the others; times are medians over the processes,
-each the best of three runs after a first one that compiles and warms up. Memory is the peak of resident memory above
-what the imports take. All solve the same ODE by as many Runge-Kutta steps of fourth order, through the same smooth
-random volume, from the same rays, in float32, and the table shows that they land alike (mean OPD in µm, and the
-gradient's absolute sum). A package that isn't installed (`pip install torchdic[bench]`) is reported as missing.
+Each way of ray_rivals.py runs in a process of its own, in turn with the others; times are the least over the processes
+and their three runs each, after a first one that compiles and warms up: wall clock, and in brackets what the process's
+threads took together, which a busy machine disturbs less. Memory is the peak of resident memory above what the imports
+take. Threads: OMP_NUM_THREADS, NUMBA_NUM_THREADS; JAX takes as many as the process may use (`taskset -c 0`). All solve
+the same ODE by as many Runge-Kutta steps of fourth order, through the same smooth random volume, from the same rays, in
+float32, and the table shows that they land alike (mean OPD in µm, and the gradient's absolute sum). A package that
+isn't installed (`pip install torchdic[bench]`) is reported as missing.
 """
 
 import argparse
@@ -14,7 +16,6 @@ import importlib
 import importlib.util
 import json
 import resource
-import statistics
 import subprocess
 import sys
 import time
@@ -64,17 +65,17 @@ def main() -> None:
         if missing[way]:
             print(f"| {way} | not installed: {', '.join(missing[way])} | | | | | |")
         else:
-            print(row(way, {key: statistics.median(r[key] for r in found[way]) for key in found[way][0]}))
+            print(row(way, {key: min(r[key] for r in found[way]) for key in found[way][0]}))
 
 
-def row(way: str, middle: dict[str, float]) -> str:
+def row(way: str, least: dict[str, float]) -> str:
     """A line of the table; a way without a gradient has none."""
-    cells = [f"{middle['forward']:.2f} s", f"{middle['forward peak']:.0f} MiB"]
-    if "gradient" in middle:
-        cells += [f"{middle['gradient']:.2f} s", f"{middle['gradient peak']:.0f} MiB"]
+    cells = [f"{least['forward']:.2f} s ({least['forward process']:.2f})", f"{least['forward peak']:.0f} MiB"]
+    if "gradient" in least:
+        cells += [f"{least['gradient']:.2f} s ({least['gradient process']:.2f})", f"{least['gradient peak']:.0f} MiB"]
     else:
         cells += ["", ""]
-    cells += [f"{middle['mean OPD']:.6f}", f"{middle['gradient sum']:.4g}" if "gradient" in middle else ""]
+    cells += [f"{least['mean OPD']:.6f}", f"{least['gradient sum']:.4g}" if "gradient" in least else ""]
     return f"| {way} | {' | '.join(cells)} |"
 
 
@@ -87,24 +88,25 @@ def measure(way: str, shape: tuple[int, ...], steps: int) -> dict[str, float]:
     imported = peak()
     trial = getattr(ray_rivals, way)(delta, steps)
     found = {}
-    found["forward"], (_, opd) = best(trial.forward)
+    found["forward"], found["forward process"], (_, opd) = best(trial.forward)
     found["forward peak"] = peak() - imported
     found["mean OPD"] = float(opd.mean())
     if hasattr(trial, "gradient"):
-        found["gradient"], gradient = best(trial.gradient)
+        found["gradient"], found["gradient process"], gradient = best(trial.gradient)
         found["gradient peak"] = peak() - imported
         found["gradient sum"] = float(np.abs(gradient).sum())
     return found
 
 
-def best(run: Callable) -> tuple[float, tuple | np.ndarray]:
-    """Seconds of the best of three runs after a first one, and what they gave."""
-    result, seconds = run(), []
+def best(run: Callable) -> tuple:
+    """Seconds of the best of three runs after a first one, of the process's threads together, and what they gave."""
+    result, seconds, process = run(), [], []
     for _ in range(3):
-        start = time.perf_counter()
+        start, used = time.perf_counter(), time.process_time()
         result = run()
         seconds.append(time.perf_counter() - start)
-    return min(seconds), result
+        process.append(time.process_time() - used)
+    return min(seconds), min(process), result
 
 
 def peak() -> float:

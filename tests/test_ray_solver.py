@@ -1,6 +1,7 @@
 """The hand-written derivatives are those of what was computed: against autograd through torchdiffeq, to rounding."""
 
 import dataclasses
+from unittest import mock
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torchdiffeq import odeint
 from torchdic import Fidelity, Grid
 from torchdic.ray_equation import RayEquation
 from torchdic.ray_solver import TABLEAUX, solve
+from torchdic.rays import kept_by_rays
 from torchdic.recompute import recompute
 from torchdic.sampling import SliceSampler, spline_coefficients
 
@@ -65,7 +67,8 @@ def test_slopes_are_those_of_the_equation(case):
     equation, _ = problem(**case)
     state = 0.01 * torch.randn_like(equation.start())
     with torch.no_grad():
-        torch.testing.assert_close(equation.slopes(0.3, state), plain_slopes(equation, 0.3, state), rtol=0, atol=1e-14)
+        slopes = equation.slopes(equation.meet(0.3, state[:4]))
+        torch.testing.assert_close(slopes, plain_slopes(equation, 0.3, state), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("solver", [*TABLEAUX, "dopri5"])
@@ -92,7 +95,7 @@ def test_gradient_in_everything_is_autograds_through_torchdiffeq(case, solver):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
 
 
-def test_backward_pass_keeps_a_state_per_evaluation_and_nothing_else():
+def test_backward_pass_keeps_where_a_step_began_and_what_it_sampled_and_nothing_else():
     equation, _ = problem(absorbing=True, turn=True)
     depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
     kept = {}
@@ -104,8 +107,29 @@ def test_backward_pass_keeps_a_state_per_evaluation_and_nothing_else():
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
         solve(equation, equation.start(), depths, Fidelity("rays"))
     own = {t.untyped_storage().data_ptr() for t in equation.tensors}
-    state = equation.start().untyped_storage().nbytes()
-    assert sum(size for pointer, size in kept.items() if pointer not in own) == 4 * 8 * state
+    value = equation.start()[0].nbytes
+    # δy, δx and their momenta; of 4 stages Δn with its gradient, and κ
+    assert sum(size for pointer, size in kept.items() if pointer not in own) == 8 * (4 + 4 * 4) * value
+
+
+@pytest.mark.parametrize("solver", TABLEAUX)
+@pytest.mark.parametrize("absorbing", [False, True])
+def test_kept_by_rays_is_what_is_kept(solver, absorbing):
+    """The estimate that decides whether slabs are recomputed."""
+    equation, _ = problem(absorbing=absorbing)
+    depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
+    kept = {}
+
+    def keep(tensor):
+        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        return tensor
+
+    fidelity = Fidelity("rays", solver=solver, steps=8)
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        solve(equation, equation.start(), depths, fidelity)
+    own = {t.untyped_storage().data_ptr() for t in equation.tensors}
+    values = sum(size for pointer, size in kept.items() if pointer not in own) / equation.start()[0].nbytes
+    assert values == kept_by_rays(GRID, fidelity, absorbs=absorbing)
 
 
 def test_nothing_is_kept_where_nothing_is_learned():
@@ -115,6 +139,19 @@ def test_nothing_is_kept_where_nothing_is_learned():
     equation = dataclasses.replace(equation, straight=straight, background=background, index=index)
     depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
     assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+
+
+def test_nothing_is_kept_without_gradients():
+    """Parameters require grad there too."""
+    equation, _ = problem()
+    depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
+    sizes = []
+    with (
+        torch.no_grad(),
+        mock.patch.object(torch.autograd.function.FunctionCtx, "save_for_backward", lambda _, *t: sizes.append(len(t))),
+    ):
+        assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+    assert sizes == [len(equation.tensors)]
 
 
 def test_volume_changed_between_the_passes_is_an_error_not_a_wrong_gradient():

@@ -145,3 +145,31 @@ def test_nan_place_has_a_nan_value_and_spoils_no_other():
     y = torch.tensor([0.1, math.nan, 0.3], dtype=torch.float64)
     value, _, _ = sampler(GRID, field, "cubic").sample(0.2, y, torch.zeros(3).double())
     assert value.isnan().tolist() == [False, True, False]
+
+
+@BOTH
+@pytest.mark.parametrize("shape", [(4, 6, 5), (1, 1, 5), (3, 2, 1)], ids=str)
+def test_pull_back_is_what_autograd_finds(interpolation, shape):
+    """Rays beyond every side too, where the index is continued and the slope falls to 0."""
+    grid = Grid(shape, (0.5, 0.2, 0.3))
+    slices = torch.randn(shape, dtype=torch.float64, requires_grad=True)
+    found = SliceSampler(grid, slices.unbind(0), interpolation)
+    y, x = (v.requires_grad_() for v in random_places(300, 2.0))
+    z = grid.centre(0, 0) + 0.13
+    for sample, pull_back, weights in (
+        (found.sample, found.pull_back, torch.randn(3, 300, dtype=torch.float64)),
+        (found.value, found.pull_back_value, torch.randn(300, dtype=torch.float64)),
+    ):
+        plane = found.plane(z).detach().requires_grad_()
+        part = found.sample_plane if weights.ndim == 2 else found.value_plane
+        y_bar, x_bar, plane_bar = torch.autograd.grad((part(plane, y, x) * weights).sum(), (y, x, plane))
+        torch.testing.assert_close(part(plane, y, x), sample(z, y, x), rtol=0, atol=0)
+        place, voxels = pull_back(z, y.detach(), x.detach(), weights)
+        torch.testing.assert_close(place, torch.stack((y_bar, x_bar)), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(voxels, plane_bar, rtol=1e-12, atol=1e-12)
+
+
+def test_pull_back_skips_voxels_that_no_one_learns():
+    found = sampler(GRID, torch.randn(GRID.shape, dtype=torch.float64), "linear")
+    y, x = random_places(10)
+    assert found.pull_back(0.1, y, x, torch.ones(3, 10, dtype=torch.float64))[1] is None

@@ -90,7 +90,8 @@ def _scalar_images(
         for prism, transfer in zip(acquisition.prisms, transfers, strict=True):
             field = to_field(wave if transfer is None else wave * transfer)
             if prism is None or polarisation is None:
-                images.append(torch.einsum("syxc,s->yx", torch.view_as_real(field).square(), weights))
+                # over the sources first: a sum over two neighbours in memory is slow
+                images.append(torch.tensordot(weights, torch.view_as_real(field).square(), 1).sum(-1))
             else:
                 stopped = to_field(wave * prism.parallel(frequencies))
                 images.append(torch.einsum("syx,s->yx", polarisation.intensity(field, stopped, prism.bias), weights))

@@ -28,7 +28,8 @@ from torchdic.condenser import Condenser
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.image_error import relative
-from torchdic.microscope import Acquisition, Microscope, SamplingWarning, check_apertures, image
+from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_apertures
+from torchdic.microscope import image
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
 
@@ -74,8 +75,8 @@ class Effect:
 class Plan:
     """The cheapest fidelity that meets a tolerance, with what it is expected to give.
 
-    error: predicted, as `torchdic.image_error` defines it. seconds: of one `image` without gradients, predicted. met: whether
-    the tolerance is. planning: seconds that the plan took.
+    error: predicted, as `torchdic.image_error` defines it. seconds: of one `image` without gradients, predicted. met:
+    whether the tolerance is. planning: seconds that the plan took.
     """
 
     fidelity: Fidelity
@@ -122,12 +123,12 @@ def describe(fidelity: Fidelity) -> str:
 
 @torch.no_grad()
 def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
-    """The cheapest Fidelity whose images err by at most `tolerance` (see `torchdic.image_error`), and what each effect is worth.
+    """The cheapest Fidelity whose images err by at most `tolerance`, and what each effect is worth.
 
-    Where the specimen stays clear of the sides the truth is the specimen alone in its medium; where it reaches them,
-    the periodic array that `image` computes without padding. Nothing in it is random, and no choice hangs on a clock.
-    Raises ValueError for a tolerance that isn't positive, and as `image` does. Warns ToleranceWarning where no fidelity
-    meets the tolerance: the plan is then the best one found.
+    The error is that of `torchdic.image_error`. Where the specimen stays clear of the sides the truth is the specimen
+    alone in its medium; where it reaches them, the periodic array that `image` computes without padding. Nothing in it
+    is random, and no choice hangs on a clock. Raises ValueError for a tolerance that isn't positive, and as `image`
+    does. Warns ToleranceWarning where no fidelity meets the tolerance: the plan is then the best one found.
     """
     if not (isinstance(tolerance, int | float) and 0 < tolerance < math.inf):
         raise ValueError(f"tolerance {tolerance} must be above 0, and finite")

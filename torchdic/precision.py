@@ -24,7 +24,8 @@ from torch.profiler import ProfilerActivity, profile
 from torchdic.fidelity import Fidelity, Propagation
 from torchdic.grid import Grid
 from torchdic.image_error import image_error
-from torchdic.microscope import Acquisition, Microscope, image
+from torchdic.instrument import Acquisition, Microscope
+from torchdic.microscope import image
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
 

@@ -1,13 +1,14 @@
 """The right-hand side of the ray ODE (see `torchdic.rays`), and its derivative written out by hand.
 
 Autograd would keep every intermediate value: some 27 for each ray and evaluation where the index is linear, 115 where
-it is a cubic spline. By hand the backward pass needs the ray's state alone, and samples the index once more. With
-p = p0 + δp, n = n0 + Δn, v = p0/p_z0 and r = 1/p_z the slopes are
+it is a cubic spline. By hand the backward pass needs where a ray was and what it met there. With p = p0 + δp,
+n = n0 + Δn, v = p0/p_z0 and r = 1/p_z the slopes are
 
     δy' = r (δp_y − v_y q),    δp_y' = r n ∂n/∂y,    W' = r (B + |δp|² + q²)/2,
-    ∫κ ds: r n κ,    τ' = r (p_x ∂n/∂y − p_y ∂n/∂x)/(n + p_z),
+    ∫κ ds: r n κ,    τ' = r (p_x ∂n/∂y − p_y ∂n/∂x)/(n + p_z).
 
-and q, which is formed without cancellation, has the derivative of p_z − p_z0.
+q = (p_z² − p_z0²)/(p_z + p_z0), its numerator B − δp·(δp + 2p0) free of cancellation, differs as p_z − p_z0 does.
+No slope depends on the last three, the sums along the ray.
 """
 
 from dataclasses import dataclass
@@ -19,13 +20,16 @@ from torch import Tensor
 
 from torchdic.sampling import SliceSampler
 
+# δy, δx, δp_y, δp_x come first in a state, then the sums.
+MOVING = 4
+
 
 @dataclass(frozen=True, eq=False)
 class RayEquation:
     """The ODE of many rays at once, in a state of δy, δx, δp_y, δp_x, W, ∫κ ds if light is absorbed, τ if `turn`.
 
     straight: (7, …), the unperturbed rays' y and x on the first face, v_y, v_x, p_y, p_x and p_z. background: n0, 0-d.
-    index, absorption: Δn and κ. face: depth of the first face in µm. Its methods build no graph.
+    index, absorption: Δn and κ. face: depth of the first face in µm. Its methods want torch.no_grad().
     """
 
     straight: Float[Tensor, "7 *ray"]
@@ -43,114 +47,138 @@ class RayEquation:
 
     def start(self) -> Float[Tensor, "component *ray"]:
         """The state on the first face."""
-        components = 5 + (self.absorption is not None) + self.turn
+        components = MOVING + 1 + (self.absorption is not None) + self.turn
         return self.straight.new_zeros(components, *self.straight.shape[1:])
 
-    def slopes(self, z: float, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
-        """d(state)/dz at depth z."""
-        (dpy, dpx), (vy, vx) = state[2:4], self.straight[2:4]
-        y, x = self._positions(z, state)
-        delta, gy, gx = self.index.sample(z, y, x)
-        n, py, px, pz, r, q, path = self._momenta(state, delta)
-        bend = n * r
-        slopes = torch.empty_like(state)
-        torch.addcmul(dpy, vy, q, value=-1, out=slopes[0]).mul_(r)
-        torch.addcmul(dpx, vx, q, value=-1, out=slopes[1]).mul_(r)
-        torch.mul(gy, bend, out=slopes[2])
-        torch.mul(gx, bend, out=slopes[3])
-        torch.mul(path, r, out=slopes[4])
-        if self.absorption is not None:
-            torch.mul(self.absorption.value(z, y, x), bend, out=slopes[5])
-        if self.turn:
-            torch.mul(px, gy, out=slopes[-1]).addcmul_(py, gx, value=-1).mul_(r).div_(n + pz)
+    def meet(self, z: float, moving: Float[Tensor, "4 *ray"]) -> "Met":
+        """What rays meet at depth z."""
+        y, x = self._positions(z, moving)
+        kappa = None if self.absorption is None else self.absorption.value(z, y, x)
+        return self.momenta(moving, self.index.sample(z, y, x), kappa)
+
+    def momenta(
+        self, moving: Float[Tensor, "4 *ray"], index: Float[Tensor, "3 *ray"], kappa: Float[Tensor, " *ray"] | None
+    ) -> "Met":
+        """As `meet`, of what was sampled before."""
+        delta, dp, pz0 = index[0], moving[2:], self.straight[6]
+        path = (delta + 2 * self.background).mul_(delta)
+        rise = torch.add(dp, self.straight[4:6], alpha=2).mul_(dp)
+        rise = torch.sub(path, rise[0], out=rise[0]).sub_(rise[1])
+        pz = torch.addcmul(rise, pz0, pz0).sqrt_()
+        q = rise.div_(pz + pz0)
+        path.addcmul_(dp[0], dp[0]).addcmul_(dp[1], dp[1]).addcmul_(q, q)
+        return Met(moving, index, kappa, delta + self.background, pz, pz.reciprocal(), q, path)
+
+    def moves(self, met: "Met") -> Float[Tensor, "4 *ray"]:
+        """The slopes of δy, δx, δp_y and δp_x."""
+        slopes = torch.empty_like(met.moving)
+        torch.addcmul(met.moving[2:], self.straight[2:4], met.q, value=-1, out=slopes[:2])
+        slopes[:2].mul_(met.r)
+        torch.mul(met.sampled[1:], met.n * met.r, out=slopes[2:])
         return slopes
 
-    def pull_back(self, z: float, state: Tensor, slopes_bar: Tensor) -> "Pulled":
-        """The loss's derivatives in what `slopes` was made from, given its derivative in the slopes.
+    def slopes(self, met: "Met") -> Float[Tensor, "component *ray"]:
+        """d(state)/dz."""
+        sums = [torch.mul(met.path, met.r).mul_(0.5)]
+        if met.kappa is not None:
+            sums.append((met.kappa * met.n).mul_(met.r))
+        if self.turn:
+            sums.append(self._swept(met).mul_(met.r))
+        return torch.cat((self.moves(met), torch.stack(sums)))
+
+    def pull_back(self, z: float, met: "Met", moves_bar: Tensor, sums_bar: Tensor, h: float) -> "Pulled":
+        """The loss's derivatives in what was met at depth z, from those in `moves` and, h times, in the sums.
 
         A name that ends in _bar is the loss's derivative in that value.
         """
-        (dpy, dpx), (vy, vx) = state[2:4], self.straight[2:4]
-        place = [v.requires_grad_() for v in self._positions(z, state)]
-        planes = [s.plane(z).requires_grad_() for s in (self.index, self.absorption) if s is not None]
-        with torch.enable_grad():
-            sampled = [*self.index.sample_plane(planes[0], *place)]
-            if self.absorption is not None:
-                sampled.append(self.absorption.value_plane(planes[1], *place))
-        delta, gy, gx, *kappa = (v.detach() for v in sampled)
-        n, py, px, pz, r, q, path = self._momenta(state, delta)
+        (_, gy, gx), n, pz, r, q = met.sampled, met.n, met.pz, met.r, met.q
+        dp, v = met.moving[2:], self.straight[2:4]
+        learned = self.straight.requires_grad
 
-        out = slopes_bar * r
-        gy_bar, gx_bar = n * out[2], n * out[3]
-        n_bar = (gy * out[2]).addcmul_(gx, out[3])
+        out = moves_bar * r
+        path_bar = torch.mul(sums_bar[0], r).mul_(h)
+        index_bar = torch.empty_like(met.sampled)
+        n_bar = torch.mul(gy, out[2], out=index_bar[0]).addcmul_(gx, out[3])
+        gradient_bar = torch.mul(n, out[2:], out=index_bar[1:])
         # of r, by itself and within p_z: −r² of its own
-        r_bar = (n * n_bar).addcmul_(path, out[4]).addcmul_(dpy, out[0]).addcmul_(dpx, out[1])
-        drift = (vy * out[0]).addcmul_(vx, out[1])
+        r_bar = (n * n_bar).addcmul_(met.path, path_bar, value=0.5).addcmul_(dp[0], out[0]).addcmul_(dp[1], out[1])
+        drift = (v[0] * out[0]).addcmul_(v[1], out[1])
         r_bar.addcmul_(drift, q, value=-1)
-        q_bar = (q * out[4]).sub_(drift)
-        kappa_bar = []
-        if self.absorption is not None:
-            kappa_bar.append(n * out[5])
-            n_bar.addcmul_(kappa[0], out[5])
-            r_bar.addcmul_(kappa[0], kappa_bar[0])
-        pz_bar = q_bar.clone()
-        py_bar, px_bar = torch.zeros_like(py), torch.zeros_like(px)
+        q_bar = torch.addcmul(drift, q, path_bar, value=-1).neg_()
+        kappa_bar = None
+        if met.kappa is not None:
+            kappa_out = torch.mul(sums_bar[1], r).mul_(h)
+            kappa_bar = n * kappa_out
+            n_bar.addcmul_(met.kappa, kappa_out)
+            r_bar.addcmul_(met.kappa, kappa_bar)
+        pz_bar = q_bar.clone() if learned else q_bar
+        p_bar = None
         if self.turn:
-            turn_bar = out[-1] / (n + pz)
-            area = (px * gy).addcmul_(py, gx, value=-1).mul_(turn_bar)
-            r_bar.add_(area)
-            area.div_(n + pz)
-            n_bar.sub_(area)
-            pz_bar.sub_(area)
-            px_bar.addcmul_(gy, turn_bar)
-            py_bar.addcmul_(gx, turn_bar, value=-1)
-            gy_bar.addcmul_(px, turn_bar)
-            gx_bar.addcmul_(py, turn_bar, value=-1)
+            turn_bar = torch.mul(sums_bar[-1], r).mul_(h).div_(n + pz)
+            swept = self._swept(met).mul_(turn_bar)
+            pz_bar.sub_(swept)
+            n_bar.sub_(swept)
+            r_bar.addcmul_(swept, n + pz)
+            p = dp + self.straight[4:6]
+            p_bar = torch.stack((-gx, gy)).mul_(turn_bar)
+            gradient_bar[0].addcmul_(p[1], turn_bar)
+            gradient_bar[1].addcmul_(p[0], turn_bar, value=-1)
         pz_bar.addcmul_(r_bar, r, value=-1).mul_(r)
-        n_bar.addcmul_(n, out[4]).addcmul_(n, pz_bar)
-        py_bar.addcmul_(py, pz_bar, value=-1)
-        px_bar.addcmul_(px, pz_bar, value=-1)
+        n_bar.addcmul_(n, path_bar).addcmul_(n, pz_bar)
+        p = dp + self.straight[4:6]
+        p_bar = p.mul_(pz_bar).neg_() if p_bar is None else p_bar.addcmul_(p, pz_bar, value=-1)
 
-        y_bar, x_bar, *planes_bar = torch.autograd.grad(sampled, [*place, *planes], [n_bar, gy_bar, gx_bar, *kappa_bar])
-        state_bar = torch.zeros_like(state)
-        state_bar[0], state_bar[1] = y_bar, x_bar
-        torch.addcmul(py_bar, dpy, out[4], out=state_bar[2]).add_(out[0])
-        torch.addcmul(px_bar, dpx, out[4], out=state_bar[3]).add_(out[1])
-        v_bar = torch.mul(state_bar[:2], z - self.face).addcmul_(out[:2], q, value=-1)
-        straight_bar = torch.cat((state_bar[:2], v_bar, torch.stack((py_bar, px_bar, -q_bar))))
-        background_bar = n_bar.sum() - self.background * out[4].sum()
-        return Pulled(state_bar, straight_bar, background_bar, planes_bar)
+        y, x = self._positions(z, met.moving)
+        place_bar, index_plane_bar = self.index.pull_back(z, y, x, index_bar)
+        planes_bar = [index_plane_bar]
+        if self.absorption is not None and kappa_bar is not None:
+            further, kappa_plane_bar = self.absorption.pull_back_value(z, y, x, kappa_bar)
+            place_bar.add_(further)
+            planes_bar.append(kappa_plane_bar)
+        moving_bar = torch.empty_like(met.moving)
+        moving_bar[:2] = place_bar
+        torch.addcmul(p_bar, dp, path_bar, out=moving_bar[2:]).add_(out[:2])
+        straight_bar = background_bar = None
+        if learned:
+            v_bar = torch.mul(place_bar, z - self.face).addcmul_(out[:2], q, value=-1)
+            straight_bar = torch.cat((place_bar, v_bar, p_bar, -q_bar[None]))
+        if self.background.requires_grad:
+            background_bar = n_bar.sum() - self.background * path_bar.sum()
+        return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
 
-    def _positions(self, z: float, state: Tensor) -> tuple[Tensor, Tensor]:
-        y, x = torch.add(self.straight[:2], self.straight[2:4], alpha=z - self.face).add_(state[:2])
+    def _positions(self, z: float, moving: Tensor) -> tuple[Tensor, Tensor]:
+        y, x = torch.add(self.straight[:2], self.straight[2:4], alpha=z - self.face).add_(moving[:2])
         return y, x
 
-    def _momenta(self, state: Tensor, delta: Tensor) -> "_Momenta":
-        dpy, dpx = state[2:4]
-        py0, px0, pz0 = self.straight[4:]
-        n, py, px = delta + self.background, dpy + py0, dpx + px0
-        pz = (n * n).addcmul_(py, py, value=-1).addcmul_(px, px, value=-1).sqrt_()
-        contrast = delta * (n + self.background)
-        q = contrast.addcmul(dpy, py + py0, value=-1).addcmul_(dpx, px + px0, value=-1).div_(pz + pz0)
-        path = contrast.addcmul_(dpy, dpy).addcmul_(dpx, dpx).addcmul_(q, q).mul_(0.5)
-        return _Momenta(n, py, px, pz, pz.reciprocal(), q, path)
+    def _swept(self, met: "Met") -> Tensor:
+        """τ' p_z."""
+        p = met.moving[2:] + self.straight[4:6]
+        return (p[1] * met.sampled[1]).addcmul_(p[0], met.sampled[2], value=-1).div_(met.n + met.pz)
 
 
-class Pulled(NamedTuple):
-    """The loss's derivatives in the state, the unperturbed rays, n0, and the planes of Δn and (if any) of κ."""
+class Met(NamedTuple):
+    """Rays and what they meet at one depth."""
 
-    state: Tensor
-    straight: Tensor
-    background: Tensor
-    planes: list[Tensor]
-
-
-class _Momenta(NamedTuple):
+    # δy, δx, δp_y, δp_x
+    moving: Tensor
+    # Δn, ∂n/∂y, ∂n/∂x
+    sampled: Tensor
+    kappa: Tensor | None
     n: Tensor
-    py: Tensor
-    px: Tensor
     pz: Tensor
     r: Tensor
     q: Tensor
-    # (B + |δp|² + q²)/2
+    # B + |δp|² + q²
     path: Tensor
+
+
+class Pulled(NamedTuple):
+    """The loss's derivatives in the moving components, the unperturbed rays, n0, and the planes of Δn and of any κ.
+
+    None where nobody asks.
+    """
+
+    moving: Tensor
+    straight: Tensor | None
+    background: Tensor | None
+    planes: list[Tensor | None]

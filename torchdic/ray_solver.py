@@ -1,16 +1,18 @@
-"""The ray ODE's solution by torchdiffeq, with a backward pass that keeps each evaluation's state and nothing else.
+"""The ray ODE's solution by torchdiffeq, with a backward pass that keeps what each evaluation sampled.
 
 Behind a method of equal steps the backward pass is the method's own adjoint: with stages k_i = f(s_i),
 s_i = y + h Σ_j a_ij k_j and y' = y + h Σ b_i k_i, from the last to the first
 
     k̄_i = h (b_i ȳ' + Σ_j>i a_ji s̄_j),    s̄_i = k̄_i ∂f/∂s_i,    ȳ = ȳ' + Σ s̄_i,
 
-the exact derivative of what was computed. (torchdiffeq's odeint_adjoint solves another ODE backward, whose state would
-hold the volume.) An adaptive method's backward pass is autograd's, evaluation by evaluation.
+the exact derivative of what was computed, without a second look at the volume's values but for the slope of what was
+sampled. (torchdiffeq's odeint_adjoint solves another ODE backward, whose state would hold the volume.) An adaptive
+method's backward pass is autograd's, evaluation by evaluation.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count, pairwise
 from typing import Any
 
 import torch
@@ -19,7 +21,7 @@ from torch import Tensor
 from torchdiffeq import odeint
 
 from torchdic.fidelity import ADAPTIVE, Fidelity, Solver
-from torchdic.ray_equation import Pulled, RayEquation
+from torchdic.ray_equation import MOVING, Met, Pulled, RayEquation
 from torchdic.sampling import SliceSampler, depth_weights
 
 # torchdiffeq's methods of equal steps, explicit Runge-Kutta (a, b) row by row; its rk4 is the 3/8 rule.
@@ -40,7 +42,8 @@ def solve(
     toward +z ends as nan.
     """
     if fidelity.solver not in ADAPTIVE:
-        return _EqualSteps.apply(equation, depths, fidelity.solver, state, *equation.tensors)  # pyright: ignore[reportReturnType]
+        keep = torch.is_grad_enabled()
+        return _EqualSteps.apply(equation, depths, fidelity.solver, keep, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
     def slopes(z: Tensor, state: Tensor) -> Tensor:
         return _Evaluation.apply(equation, float(z), state, *equation.tensors)  # pyright: ignore[reportReturnType]
@@ -67,47 +70,68 @@ def solve(
 class _EqualSteps(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, equation: RayEquation, depths: Tensor, solver: Solver, state: Tensor, *tensors: Tensor
+        ctx: Any,
+        equation: RayEquation,
+        depths: Tensor,
+        solver: Solver,
+        keep: bool,
+        state: Tensor,
+        *tensors: Tensor,
     ) -> Tensor:
-        visited: list[float] = []
-        states: list[Tensor] = []
-        keep = any(ctx.needs_input_grad)
+        stages = len(TABLEAUX[solver][1])
+        kept: list[Tensor] = []
+        evaluations = count()
 
         def slopes(z: Tensor, state: Tensor) -> Tensor:
+            met = equation.meet(float(z), state[:MOVING])
             if keep:
-                visited.append(float(z))
-                states.append(state)
-            return equation.slopes(float(z), state)
+                if next(evaluations) % stages == 0:  # a first stage is where its step begins
+                    kept.append(met.moving.clone())  # without the sums beside it
+                kept.extend([met.sampled] if met.kappa is None else [met.sampled, met.kappa])
+            return equation.slopes(met)
 
         options = {"grid_constructor": lambda *_: depths}
         path = odeint(slopes, state, _ends(depths, state), method=solver, options=options)
-        ctx.settings = equation, visited, depths, solver
-        ctx.save_for_backward(*tensors, *states)
+        ctx.settings = equation, depths, solver
+        ctx.save_for_backward(*tensors, *kept)
         return torch.as_tensor(path[-1])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, state_bar: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        equation, visited, depths, solver = ctx.settings
-        saved = ctx.saved_tensors
-        tensors, states = saved[: -len(visited)], saved[-len(visited) :]
-        equation = _of(equation, tensors)
-        sums = _Sums(equation)
+        equation, depths, solver = ctx.settings
+        saved, tensors = ctx.saved_tensors, len(equation.tensors)
+        equation = _of(equation, saved[:tensors])
+        kept = list(saved[tensors:])
+        del saved
+        gradients = _Gradients(equation)
         a, b = TABLEAUX[solver]
-        stages = len(b)
-        for step, h in reversed(list(enumerate(depths.diff().tolist()))):
+        absorbs = equation.absorption is not None
+        fields = 1 + absorbs
+        moving_bar, sums_bar = state_bar[:MOVING], state_bar[MOVING:]
+        for h, stages in reversed(_stages(solver, depths)):
+            moving, *sampled = kept[-1 - fields * len(b) :]
+            del kept[-1 - fields * len(b) :]
+            # the step once more, from what it sampled
+            mets: list[Met] = []
+            slopes: list[Tensor] = []
+            for i, row in enumerate(a):
+                place = _advanced(moving, slopes, row, h)
+                index, kappa = sampled[fields * i], sampled[fields * i + 1] if absorbs else None
+                mets.append(equation.momenta(place, index, kappa))
+                if i + 1 < len(b):
+                    slopes.append(equation.moves(mets[i]))
             stage_bars: list[Tensor] = []  # of stages i + 1 …, the last one first
-            for i in reversed(range(stages)):
-                k_bar = state_bar * (h * b[i])
-                for j, stage_bar in zip(reversed(range(i + 1, stages)), stage_bars, strict=True):
+            for i in reversed(range(len(b))):
+                slopes_bar = moving_bar * (h * b[i])
+                for j, stage_bar in zip(reversed(range(i + 1, len(b))), stage_bars, strict=True):
                     if a[j][i] != 0:
-                        k_bar.add_(stage_bar, alpha=h * a[j][i])
-                z, state = visited[stages * step + i], states[stages * step + i]
-                pulled = equation.pull_back(z, state, k_bar)
-                sums.add(z, pulled)
-                stage_bars.append(pulled.state)
-            state_bar = sum(stage_bars, state_bar)
-        return (None, None, None, state_bar, *sums.bars)
+                        slopes_bar.add_(stage_bar, alpha=h * a[j][i])
+                pulled = equation.pull_back(stages[i], mets.pop(), slopes_bar, sums_bar, h * b[i])
+                gradients.add(stages[i], pulled)
+                stage_bars.append(pulled.moving)
+            moving_bar = sum(stage_bars[1:], moving_bar + stage_bars[0])
+        return (None, None, None, None, torch.cat((moving_bar, sums_bar)), *gradients.bars)
 
 
 class _Evaluation(torch.autograd.Function):
@@ -115,7 +139,7 @@ class _Evaluation(torch.autograd.Function):
     def forward(ctx: Any, equation: RayEquation, z: float, state: Tensor, *tensors: Tensor) -> Tensor:
         ctx.settings = equation, z
         ctx.save_for_backward(state, *tensors)
-        return equation.slopes(z, state)
+        return equation.slopes(equation.meet(z, state[:MOVING]))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -123,36 +147,62 @@ class _Evaluation(torch.autograd.Function):
         equation, z = ctx.settings
         state, *tensors = ctx.saved_tensors
         equation = _of(equation, tensors)
-        sums = _Sums(equation)
-        pulled = equation.pull_back(z, state, slopes_bar)
-        sums.add(z, pulled)
-        return (None, None, pulled.state, *sums.bars)
+        gradients = _Gradients(equation)
+        pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), slopes_bar[:MOVING], slopes_bar[MOVING:], 1.0)
+        gradients.add(z, pulled)
+        return (None, None, torch.cat((pulled.moving, torch.zeros_like(state[MOVING:]))), *gradients.bars)
 
 
-class _Sums:
-    """The loss's derivatives in an equation's tensors, summed over its evaluations."""
+class _Gradients:
+    """The loss's derivatives in an equation's tensors, summed over its evaluations; None where nobody asks."""
 
     def __init__(self, equation: RayEquation) -> None:
-        self.bars = [torch.zeros_like(t) for t in equation.tensors]
+        self.bars = [torch.zeros_like(t) if t.requires_grad else None for t in equation.tensors]
         self._sampler = equation.index
 
     def add(self, z: float, pulled: Pulled) -> None:
-        self.bars[0].add_(pulled.straight)
-        self.bars[1].add_(pulled.background)
+        for bar, term in zip(self.bars, (pulled.straight, pulled.background), strict=False):
+            if bar is not None and term is not None:
+                bar.add_(term)
         sampler = self._sampler
         for which, plane in enumerate(pulled.planes):
+            if plane is None:
+                continue
             for i, weight in depth_weights(sampler.grid, z, sampler.interpolation).items():
-                self.bars[2 + which * len(sampler.slices) + i - sampler.first].add_(plane, alpha=weight)
+                bar = self.bars[2 + which * len(sampler.slices) + i - sampler.first]
+                if bar is not None:
+                    bar.add_(plane, alpha=weight)
+
+
+def _stages(solver: Solver, depths: Tensor) -> list[tuple[float, list[float]]]:
+    """Each step's length, and the depths of its evaluations."""
+    nodes = [sum(row) for row in TABLEAUX[solver][0]]
+    # the end itself, where rounding could lie beyond it: a slab has only its own slices
+    return [
+        (last - first, [last if c == 1 else first + c * (last - first) for c in nodes])
+        for first, last in pairwise(depths.tolist())
+    ]
+
+
+def _advanced(moving: Tensor, slopes: Sequence[Tensor], row: Sequence[float], h: float) -> Tensor:
+    """Moving + h Σ row_j slopes_j."""
+    if not any(row):
+        return moving
+    (first, slope), *others = [(h * c, k) for c, k in zip(row, slopes, strict=True) if c != 0]
+    moved = torch.add(moving, slope, alpha=first)
+    for c, slope in others:
+        moved.add_(slope, alpha=c)
+    return moved
 
 
 def _of(equation: RayEquation, tensors: Sequence[Tensor]) -> RayEquation:
     """The equation on its tensors as autograd hands them back."""
-    straight, background, *slices = (t.detach() for t in tensors)
+    straight, background, *slices = tensors
     index = equation.index
-    count = len(index.slices)
+    own = len(index.slices)
     samplers = [
         SliceSampler(index.grid, part, index.interpolation, index.first) if part else None
-        for part in (slices[:count], slices[count:])
+        for part in (slices[:own], slices[own:])
     ]
     return replace(equation, straight=straight, background=background, index=samplers[0], absorption=samplers[1])
 

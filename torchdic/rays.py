@@ -29,7 +29,7 @@ from torch import Tensor
 from torchdic.fidelity import ADAPTIVE, Fidelity
 from torchdic.grid import Grid
 from torchdic.ray_equation import RayEquation
-from torchdic.ray_solver import solve
+from torchdic.ray_solver import TABLEAUX, solve
 from torchdic.recompute import recompute, slabs
 from torchdic.sampling import SliceSampler, spline_coefficients, window
 from torchdic.volume import Volume
@@ -148,7 +148,8 @@ def deviation(
     # kept on the CPU: a depth read from another device would make every stage wait for it
     depths = face + grid.extent[0] * torch.arange(steps + 1, dtype=state.dtype) / steps
     depths[-1] = -face
-    crowded = kept_by_rays(grid, fidelity) * state[0].numel() * state.element_size() > fidelity.memory
+    kept = kept_by_rays(grid, fidelity, absorbs=volume.absorption is not None)
+    crowded = kept * state[0].numel() * state.element_size() > fidelity.memory
     for first, last in pairwise(range(steps + 1)) if watch else slabs(steps, split=crowded and equal_steps):
         state = recompute(cross, first, last, state, when=crowded)
         if watch:
@@ -164,6 +165,8 @@ def deviation(
     return Deviation(position, momentum, state[4], absorbed, state[-1] if turn else None)
 
 
-def kept_by_rays(grid: Grid, fidelity: Fidelity) -> int:
-    """Values per ray that autograd keeps for the backward pass."""
-    return 27 * (fidelity.steps or grid.shape[0])
+def kept_by_rays(grid: Grid, fidelity: Fidelity, *, absorbs: bool = False) -> int:
+    """Values per ray that the backward pass keeps: where each step began, and what its evaluations sampled."""
+    # an adaptive solver keeps a state for each, and how many there are is known afterwards
+    evaluations = len(TABLEAUX[fidelity.solver][1]) if fidelity.solver in TABLEAUX else 6
+    return (4 + (3 + absorbs) * evaluations) * (fidelity.steps or grid.shape[0])

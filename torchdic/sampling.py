@@ -7,7 +7,7 @@ Outside the outermost voxel centres a field is constant, so its gradient there i
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -37,9 +37,7 @@ class SliceSampler:
         self.grid, self.slices, self.first = grid, slices, first
         self.interpolation: Interpolation = interpolation
 
-    def sample(
-        self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
-    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
+    def sample(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, "3 *ray"]:
         """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
         return self.sample_plane(self.plane(z), y, x)
 
@@ -58,19 +56,12 @@ class SliceSampler:
 
     def sample_plane(
         self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
-    ) -> tuple[Float[Tensor, " *ray"], Float[Tensor, " *ray"], Float[Tensor, " *ray"]]:
+    ) -> Float[Tensor, "3 *ray"]:
         """As `sample`, of a slice that `plane` blended."""
-        dy, dx = self.grid.spacing[1:]
         if self.interpolation == "cubic":
-            value, slope_y, slope_x = _sample_cubic(field, *self._indices(y, x))
-            slope_y, slope_x = slope_y / dy, slope_x / dx
-        else:
-            # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
-            padded = F.pad(field[None], (2, 2, 2, 2), mode="replicate")[0]
-            slopes_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * dy)
-            slopes_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * dx)
-            value, slope_y, slope_x = self._linear(torch.stack((padded[1:-1, 1:-1], slopes_y, slopes_x)), y, x)
-        return value, slope_y, slope_x
+            (dy, dx), (value, slope_y, slope_x) = self.grid.spacing[1:], _sample_cubic(field, *self._indices(y, x))
+            return torch.stack((value, slope_y / dy, slope_x / dx))
+        return _grid_sample(self._with_slopes(field), self._where(y, x, ring=1)).reshape(3, *y.shape)
 
     def value_plane(
         self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
@@ -78,22 +69,103 @@ class SliceSampler:
         """As `value`, of a slice that `plane` blended."""
         if self.interpolation == "cubic":
             return _sample_cubic(field, *self._indices(y, x))[0]
-        return self._linear(field[None], y, x)[0]
+        return _grid_sample(_thick(field[None]), self._where(y, x)).reshape(y.shape)
 
-    def _linear(self, channels: Tensor, y: Tensor, x: Tensor) -> Tensor:
-        """Channels (c, y, x), centred on the grid, at positions in µm: shape (c, …)."""
-        for axis in (1, 2):  # grid_sample's coordinates, −1 … 1, need two points to stand on
-            if channels.shape[axis] == 1:
-                channels = channels.repeat_interleave(2, axis)
-        ny, nx = channels.shape[1:]
+    def pull_back(
+        self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"], sampled_bar: Float[Tensor, "3 *ray"]
+    ) -> tuple[Float[Tensor, "2 *ray"], Float[Tensor, "y x"] | None]:
+        """A loss's derivatives in (y, x) and in the plane at depth z, from those in what `sample` gave.
+
+        Builds no graph. None in place of the plane's where no slice requires grad.
+        """
+        learned = any(s.requires_grad for s in self.slices)
+        with torch.no_grad():
+            plane = self.plane(z)
+            if self.interpolation == "cubic":
+                return _by_autograd(self.sample_plane, plane, y, x, sampled_bar, learned)
+            channels, where = self._with_slopes(plane), self._where(y, x, ring=1)
+            # what autograd would call, without a second forward pass
+            channels_bar, where_bar = torch.ops.aten.grid_sampler_2d_backward(
+                sampled_bar.reshape(1, 3, 1, -1), channels[None], where, 0, 1, True, [learned, True]
+            )
+            scale_y, scale_x = self._scales(ring=1)
+            place_bar = torch.empty_like(sampled_bar[:2]).reshape(2, -1)
+            torch.mul(where_bar[0, 0, :, 1], scale_y, out=place_bar[0])
+            torch.mul(where_bar[0, 0, :, 0], scale_x, out=place_bar[1])
+            plane_bar = self._with_slopes_pull_back(channels_bar[0]) if learned else None
+            return place_bar.reshape(2, *y.shape), plane_bar
+
+    def pull_back_value(
+        self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"], value_bar: Float[Tensor, " *ray"]
+    ) -> tuple[Float[Tensor, "2 *ray"], Float[Tensor, "y x"] | None]:
+        """As `pull_back`, for `value`."""
+        learned = any(s.requires_grad for s in self.slices)
+        with torch.no_grad():
+            return _by_autograd(self.value_plane, self.plane(z), y, x, value_bar, learned)
+
+    def _with_slopes(self, field: Float[Tensor, "y x"]) -> Float[Tensor, "3 yy xx"]:
+        """A field and its central differences, on one ring of voxels more."""
         dy, dx = self.grid.spacing[1:]
-        where = torch.stack((x * (2 / (dx * (nx - 1))), y * (2 / (dy * (ny - 1)))), -1).reshape(1, 1, -1, 2)
-        sampled = F.grid_sample(channels[None], where, padding_mode="border", align_corners=True)
-        return sampled.reshape(len(channels), *y.shape)
+        # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
+        padded = F.pad(field[None], (2, 2, 2, 2), mode="replicate")[0]
+        slopes_y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * dy)
+        slopes_x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * dx)
+        return torch.stack((padded[1:-1, 1:-1], slopes_y, slopes_x))
+
+    def _with_slopes_pull_back(self, channels_bar: Float[Tensor, "3 yy xx"]) -> Float[Tensor, "y x"]:
+        """The transpose of `_with_slopes`."""
+        dy, dx = self.grid.spacing[1:]
+        value_bar, slopes_y_bar, slopes_x_bar = channels_bar
+        padded_bar = F.pad(value_bar, (1, 1, 1, 1))
+        padded_bar[2:, 1:-1].add_(slopes_y_bar, alpha=1 / (2 * dy))
+        padded_bar[:-2, 1:-1].sub_(slopes_y_bar, alpha=1 / (2 * dy))
+        padded_bar[1:-1, 2:].add_(slopes_x_bar, alpha=1 / (2 * dx))
+        padded_bar[1:-1, :-2].sub_(slopes_x_bar, alpha=1 / (2 * dx))
+        rows_bar = padded_bar[2:-2]
+        rows_bar[0].add_(padded_bar[:2].sum(0))
+        rows_bar[-1].add_(padded_bar[-2:].sum(0))
+        field_bar = rows_bar[:, 2:-2]
+        field_bar[:, 0].add_(rows_bar[:, :2].sum(1))
+        field_bar[:, -1].add_(rows_bar[:, -2:].sum(1))
+        return field_bar
+
+    def _scales(self, ring: int = 0) -> tuple[float, float]:
+        """What makes grid_sample's coordinates of y and x in µm: −1 … 1 from the first voxel to the last."""
+        (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
+        return 2 / (dy * (max(ny + 2 * ring, 2) - 1)), 2 / (dx * (max(nx + 2 * ring, 2) - 1))
+
+    def _where(self, y: Tensor, x: Tensor, ring: int = 0) -> Float[Tensor, "1 1 ray 2"]:
+        """Positions in µm as grid_sample's coordinates (x, y), on a field with `ring` voxels more on each side."""
+        scale_y, scale_x = self._scales(ring)
+        # x and y apart in memory, as the kernel likes them best
+        return torch.stack((x.reshape(-1) * scale_x, y.reshape(-1) * scale_y)).T[None, None]
 
     def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
         return y / dy + (ny - 1) / 2, x / dx + (nx - 1) / 2
+
+
+def _thick(channels: Float[Tensor, "c y x"]) -> Float[Tensor, "c yy xx"]:
+    """Channels at least two voxels wide: grid_sample's coordinates, −1 … 1, need two points to stand on."""
+    for axis in (1, 2):
+        if channels.shape[axis] == 1:
+            channels = channels.repeat_interleave(2, axis)
+    return channels
+
+
+def _grid_sample(channels: Float[Tensor, "c y x"], where: Float[Tensor, "1 1 ray 2"]) -> Float[Tensor, "c ray"]:
+    return F.grid_sample(channels[None], where, padding_mode="border", align_corners=True)[0, :, 0]
+
+
+def _by_autograd(
+    sample: Callable[..., Tensor], plane: Tensor, y: Tensor, x: Tensor, sampled_bar: Tensor, learned: bool
+) -> tuple[Tensor, Tensor | None]:
+    """A loss's derivatives in (y, x) and, if learned, the plane, from those in sample(plane, y, x)."""
+    inputs = [v.detach().requires_grad_() for v in ((y, x, plane) if learned else (y, x))]
+    with torch.enable_grad():
+        sampled = sample(inputs[2] if learned else plane, inputs[0], inputs[1])
+    y_bar, x_bar, *plane_bar = torch.autograd.grad(sampled, inputs, sampled_bar)
+    return torch.stack((y_bar, x_bar)), plane_bar[0] if learned else None
 
 
 def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:
