@@ -18,9 +18,9 @@ from torchdic.recompute import recompute, slabs
 from torchdic.volume import Volume
 
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
-# beads floors from 0.25 to 0.6 err alike and 0.1 up to twice as much (benchmarks/exact_fields.py); the lower the floor,
-# the thinner the slabs that strong steps of the index want.
-LOWEST_PZ = 0.3
+# beads floors from 0.1 to 0.4 err alike (benchmarks/exact_fields.py); the lower, the thinner the slabs that strong
+# steps of the index want.
+LOWEST_PZ = 0.2
 # Energy up to which waves may grow, where none can be made: beyond it their growth is the slabs', not the specimen's.
 MOST_ENERGY = 1.1
 
@@ -93,7 +93,8 @@ def split_step(
 
     difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
     H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
-    excess = pz0 / pz.clamp_min(LOWEST_PZ) - 1
+    # −1 takes out what a screen scatters into evanescent waves, before the next half of it can scatter that back
+    excess = torch.where(pz > 0, pz0 / pz.clamp_min(LOWEST_PZ) - 1, -1)
 
     def screen(step: int) -> Tensor:
         n = n0 + slab_mean(deltas, step, steps)
