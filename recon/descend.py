@@ -18,6 +18,7 @@ from recon.planned import PlanRecord, current, follow
 from recon.regularisers import magnitude, total_variation
 from recon.schedule import cosine, held_then_annealed
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
+from torchdic.wave import UnstableError
 
 # Distance in Δn from its bounds that every voxel starts with.
 MARGIN = 1e-3
@@ -116,7 +117,10 @@ def descend(
         else:
             plans = follow(plans, number, delta, grid, background, microscope, acquisition, fidelity)
             careful = current(plans)
-        images = image(Volume(grid, delta, background), microscope, acquisition, careful)
+        try:
+            images = image(Volume(grid, delta, background), microscope, acquisition, careful)
+        except UnstableError as error:
+            raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
         misfit = gaussian(images, data, variance)
         loss = misfit
         tv = held_then_annealed(number, recipe.steps, *recipe.tv)

@@ -340,7 +340,7 @@ def test_caustics_are_not_counted_where_a_bound_rules_them_out(delta, counted, m
 
 
 def test_counting_caustics_takes_neither_transforms_nor_evaluations(delta, counted, monkeypatch):
-    """Tubes are made of the rays that there are: a tenth more of bytes, at once and for the backward pass."""
+    """Tubes are made of the rays that there are: a tenth more of bytes at once, none for the backward pass."""
     plain = taking(delta, propagation="rays")
     learned = taking(delta, propagation="rays", learned=True)
     cost, most, saved, images = counted(plain), peak(plain), kept(learned), plain()
@@ -352,7 +352,7 @@ def test_counting_caustics_takes_neither_transforms_nor_evaluations(delta, count
     assert len(looked) == SLICES
     assert torch.equal(plain(), images)
     assert most < peak(plain) < 1.15 * most
-    assert saved < kept(learned) < 1.15 * saved
+    assert saved <= kept(learned) < 1.15 * saved
 
 
 STRAIN = {1: (0.0, 0.0), 6: (0.1, 0.0)}

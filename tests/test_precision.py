@@ -179,7 +179,7 @@ def test_rays_that_turn_are_a_failure_with_its_reason():
     grid = Grid((8, 24, 24), (0.25, 0.1, 0.1))
     strong = Volume(grid, Bead(0.9, -0.3, 1.5).delta(grid), 1.5)
     scope = Microscope(0.546, Objective(1.2), Condenser(1.19))
-    reference = Fidelity("wave", sources=9)
+    reference = Fidelity("wave", sources=9, steps=64)
     rays, wave = work_precision(
         strong, scope, Acquisition(), [replace(reference, propagation="rays"), reference], reference, repeats=1
     )

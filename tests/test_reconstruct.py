@@ -362,7 +362,7 @@ def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
     path = other({"reconstruction": {"learning_rate": 1e30}})
     code, err = command("reconstruct", path, "--out", earlier)
     assert code == 1
-    assert "torchdic: error: the descent diverged at step 2: the loss is" in err
+    assert "torchdic: error: the descent diverged at step 2: " in err
     assert "Traceback" not in err
     after = content(earlier)
     assert set(after) == RESULTS
@@ -619,7 +619,7 @@ def test_rays_that_turn_are_told_in_one_line(other, tmp_path):
 
 
 def test_a_volume_that_explains_less_than_empty_medium_is_warned_of(other, tmp_path):
-    path = other({"reconstruction": {"steps": 3, "learning_rate": 1.0}})
+    path = other({"reconstruction": {"steps": 3, "learning_rate": 0.04}})
     with pytest.warns(reconstruct.PoorFitWarning, match="empty medium would explain the stack better"):
         reconstruct.reconstruct(load(path), tmp_path / "out", torch.device("cpu"))
 

@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 # Least standard deviation, in units of the empty bright field, that an image's error is compared with: the shot noise
-# of a million electrons, below any camera's. It gives an empty scene's error a meaning.
-FLOOR = 1e-3
+# of ten thousand electrons, a usual camera's. It gives an empty scene's error a meaning.
+FLOOR = 0.01
 
 
 def image_error(images: Float[Tensor, "prism focus y x"], truth: Float[Tensor, "prism focus y x"]) -> float:

@@ -32,6 +32,7 @@ from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_
 from torchdic.microscope import image
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
+from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
 MARGIN = 0.6
@@ -161,6 +162,11 @@ class _Pilot:
     def __call__(self, fidelity: Fidelity) -> Tensor:
         return image(self.volume, self.microscope, self.acquisition, fidelity)
 
+    def nothing(self) -> Tensor:
+        """Images of nan, for what can't be computed."""
+        _, ny, nx = self.volume.grid.shape
+        return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), ny, nx), math.nan)
+
     @property
     def slices(self) -> int:
         return self.volume.grid.shape[0]
@@ -276,7 +282,12 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
 
     def run(steps: int, order: int = 2) -> Tensor:
         if (steps, order) not in runs:
-            runs[steps, order] = pilot(Fidelity("wave", steps=steps, order=1 if order == 1 else 2))
+            try:
+                runs[steps, order] = pilot(Fidelity("wave", steps=steps, order=1 if order == 1 else 2))
+            except UnstableError:
+                if steps >= 8 * slices:
+                    raise
+                runs[steps, order] = pilot.nothing()
         return runs[steps, order]
 
     fine = max(slices, 2)
@@ -285,7 +296,7 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
         coarser, middle, finest = (run(m) for m in ladder[-3:])
         last = relative(finest - middle, finest)
         # between first order, at edges, and the split step's second
-        ratio = min(max(relative(middle - coarser, finest) / max(last, 1e-300), 1.5), 4.0)
+        ratio = min(max(1.5, relative(middle - coarser, finest) / max(last, 1e-300)), 4.0)
         if last / (ratio - 1) <= MARGIN / 2 * tolerance or ladder[-1] >= 8 * slices:
             break
         ladder.append(2 * ladder[-1])
@@ -295,7 +306,10 @@ def _ways(pilot: _Pilot, tolerance: float) -> tuple[list[_Choice], Tensor]:
     for order in (2, 1):
         steps = ladder[-1]
         while steps >= 1:
-            ways.append(_Choice(Fidelity("wave", steps=steps, order=1 if order == 1 else 2), run(steps, order) - truth))
+            lacks = run(steps, order) - truth
+            if not bool(torch.isfinite(lacks).all()):
+                break
+            ways.append(_Choice(Fidelity("wave", steps=steps, order=1 if order == 1 else 2), lacks))
             if steps == 1 or relative(ways[-1].lacks, truth) > 4 * tolerance:
                 break
             steps = -(-steps // 2)

@@ -28,6 +28,7 @@ from torchdic.instrument import Acquisition, Microscope
 from torchdic.microscope import image
 from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
+from torchdic.wave import UnstableError
 
 T = TypeVar("T")
 # What a fidelity says about the model; all else says how carefully that is computed.
@@ -150,7 +151,7 @@ def trials(
     for candidate in given:
         try:
             yield _trial(scene, candidate, converged(candidate.fidelity), wave, truth, repeats)
-        except TurnedRaysError as error:
+        except (TurnedRaysError, UnstableError) as error:
             yield Trial(candidate.label, candidate, failure=str(error))
 
 

@@ -6,6 +6,7 @@ f_s = p0/λ. So the envelope of an unperturbed plane wave is 1.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
@@ -56,8 +57,22 @@ def paraxial_difference(
 
 def exp_i(phase: Tensor) -> Tensor:
     """exp(i·phase) of a real phase, or of a complex one where light is absorbed."""
-    # five times as fast as torch.polar on the CPU
-    return torch.exp(1j * phase) if phase.is_complex() else torch.complex(phase.cos(), phase.sin())
+    return torch.exp(1j * phase) if phase.is_complex() else _ExpI.apply(phase)  # pyright: ignore[reportReturnType]
+
+
+class _ExpI(torch.autograd.Function):
+    """Five times as fast as torch.polar on the CPU, and keeps its result alone."""
+
+    @staticmethod
+    def forward(ctx: Any, phase: Tensor) -> Tensor:
+        result = torch.complex(phase.cos(), phase.sin())
+        ctx.save_for_backward(result)
+        return result
+
+    @staticmethod
+    def backward(ctx: Any, result_bar: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (result,) = ctx.saved_tensors
+        return result.real * result_bar.imag - result.imag * result_bar.real
 
 
 def to_spectrum(field: Tensor) -> Tensor:
