@@ -105,3 +105,21 @@ def measured_file():
         return path
 
     return find
+
+
+def pytest_addoption(parser):
+    parser.addoption("--table", action="store_true", help="print the laws of test_stability.py and what was measured")
+
+
+def pytest_terminal_summary(terminalreporter):
+    """With --table, each cell of the stability matrix: its law, what was measured and what it may be."""
+    if not terminalreporter.config.getoption("--table"):
+        return
+    reports = [r for outcome in ("passed", "failed") for r in terminalreporter.getreports(outcome) if r.when == "call"]
+    cells = [value for r in reports for name, value in r.user_properties if name == "stability"]
+    terminalreporter.section("stability")
+    terminalreporter.write_line("| case | propagation | pass | dtype | law | measured | at most |")
+    terminalreporter.write_line("|---|---|---|---|---|---|---|")
+    for case, propagation, kind, dtype, law, measured, limit in sorted(cells):
+        numbers = f"{measured:.3g} | {limit:.3g}" if limit or measured else "0 | 0"
+        terminalreporter.write_line(f"| {case} | {propagation} | {kind} | {dtype} | {law} | {numbers} |")

@@ -127,7 +127,7 @@ def check_apertures(microscope: Microscope, background: float) -> None:
 
 
 def check_sampling(microscope: Microscope, grid: Grid) -> None:
-    """Warn with SamplingWarning, on behalf of a caller's caller, where the voxels are coarser than the light."""
+    """Warn with SamplingWarning, on behalf of a caller's caller, where voxels or frequencies are coarser than light."""
     reach = microscope.reach
     coarsest = max((d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=0.0)
     shortest = min(part.wavelength for part, _ in microscope.colours())
@@ -135,6 +135,15 @@ def check_sampling(microscope: Microscope, grid: Grid) -> None:
         warnings.warn(
             f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "
             f"{shortest / (2 * reach):.3g} µm: the finest detail is lost",
+            SamplingWarning,
+            stacklevel=3,
+        )
+    widest = max((n * d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=math.inf)
+    if microscope.objective is not None and microscope.objective.na < shortest / widest:
+        warnings.warn(
+            f"objective NA {microscope.objective.na:g} is narrower than one frequency of the array, λ/L = "
+            f"{shortest / widest:.3g}: no detail of the specimen passes; a side L above "
+            f"{shortest / microscope.objective.na:.3g} µm holds the first",
             SamplingWarning,
             stacklevel=3,
         )
