@@ -47,6 +47,7 @@ from torchdic import (
     Volume,
     image,
 )
+from torchdic.landing import SidewaysError
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
 from torchdic.wave import UnstableError
@@ -73,8 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ConfigError, StackError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
-        return _fail(f"{options.config}: {error}; the wave has no such limit", BAD_INPUT)
-    except UnstableError as error:
+        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
+    except (UnstableError, SidewaysError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)

@@ -80,7 +80,9 @@ def scenes(draw, odd=False):
         return draw(st.floats(low, high, allow_subnormal=False))
 
     across = st.integers(0, 6).map(lambda n: 2 * n + 1) if odd else st.integers(1, 13)
-    grid = Grid((draw(st.integers(1, 5)), draw(across), draw(across)), (number(0.1, 0.6), number(0.12, 0.3), number(0.12, 0.3)))
+    grid = Grid(
+        (draw(st.integers(1, 5)), draw(across), draw(across)), (number(0.1, 0.6), number(0.12, 0.3), number(0.12, 0.3))
+    )
     background = number(1.3, 1.6)
     angles = draw(st.lists(st.tuples(st.floats(0, 0.9), st.floats(0, 6.28)), min_size=1, max_size=4))
     points = torch.tensor([[r * math.sin(a), r * math.cos(a)] for r, a in angles], dtype=torch.float64)
@@ -143,7 +145,7 @@ def test_reversing_shear_and_bias_changes_no_bit(propagation, scene):
 @few
 @given(scene=scenes())
 def test_swapping_y_and_x_of_everything_transposes_the_images(propagation, scene):
-    # Noll's terms of the same order swap or change sign; those that do neither are left out
+    # the terms that y and x enter alike
     scene = replace(scene, aberrations={n: a for n, a in scene.aberrations.items() if n in (4, 5, 11)})
     grid = Grid(*((v[0], v[2], v[1]) for v in (scene.grid.shape, scene.grid.spacing)))
     other = replace(scene.turned(lambda f: f.transpose(1, 2)), grid=grid, points=scene.points.flip(1))
