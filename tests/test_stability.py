@@ -8,7 +8,7 @@ from functools import cache
 
 import pytest
 import torch
-from hard_cases import CASES, Case
+from hard_cases import CASES, GRID, N0, Case, Scene
 
 # Gradients smaller than this, per unit of a weighted sum of some hundred pixels, count as 0.
 FLOOR = 0.01
@@ -150,3 +150,14 @@ def test_case_is_warned_about_in_a_line_that_says_what_to_do(case, propagation):
     category, line = case.warned[propagation]
     with pytest.warns(category, match=line):
         case.scene().images(propagation, values_in(case, torch.float64))
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.SamplingWarning")
+def test_light_that_rounds_onto_the_mediums_index_is_refused(propagation):
+    """1.36 − 1e-8 is below the index in float64 and equal to it in float32, where p_z would be 0."""
+    scene = Scene(torch.full(GRID.shape, 1e-3, dtype=torch.float64), sources=((0.0, N0 - 1e-8),), na=1.0, na_c=1.0)
+    double, single = ({n: v.to(d) for n, v in scene.start().items()} for d in (torch.float64, torch.float32))
+    with pytest.raises(ValueError, match=r"direction n·sinθ 1\.36 must stay below the medium's index 1\.36"):
+        scene.images(propagation, single)
+    if propagation == "projection":
+        assert bool(scene.images(propagation, double).isfinite().all())

@@ -111,8 +111,11 @@ class Acquisition:
         object.__setattr__(self, "focus", tuple(self.focus))
 
 
-def check_apertures(microscope: Microscope, background: float) -> None:
-    """Raise ValueError where an aperture asks for light that the medium's index does not carry."""
+def check_apertures(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> None:
+    """Raise ValueError where an aperture asks for light that the medium's index does not carry.
+
+    dtype: in which p_z = √(n² − |p|²) must be above 0, whatever the rounding of both.
+    """
     condenser = microscope.condenser
     apertures = {"objective": microscope.objective, "condenser": condenser}
     for name, part in apertures.items():
@@ -120,7 +123,7 @@ def check_apertures(microscope: Microscope, background: float) -> None:
             raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
     if condenser is not None:
         largest = condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
-        if largest >= background:
+        if largest >= background * (1 - 4 * torch.finfo(dtype).eps):
             raise ValueError(
                 f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"
             )
