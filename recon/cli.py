@@ -55,6 +55,7 @@ from torchdic import (
 )
 from torchdic.fidelity import Propagation
 from torchdic.files import written_whole
+from torchdic.landing import SidewaysError
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
@@ -85,8 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ConfigError, StackError, CheckpointError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
-        return _fail(f"{options.config}: {error}; the wave has no such limit", BAD_INPUT)
-    except UnstableError as error:
+        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
+    except (UnstableError, SidewaysError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)

@@ -105,3 +105,29 @@ def measured_file():
         return path
 
     return find
+
+
+def pytest_addoption(parser):
+    parser.addoption("--table", action="store_true", help="print the laws of test_stability.py and what was measured")
+
+
+def pytest_terminal_summary(terminalreporter):
+    """With --table, a row for each case and propagation of the stability matrix: law, what was measured, the most."""
+    if not terminalreporter.config.getoption("--table"):
+        return
+    reports = [r for outcome in ("passed", "failed") for r in terminalreporter.getreports(outcome) if r.when == "call"]
+    rows: dict[tuple[str, str], dict[tuple[str, str], str]] = {}
+    for report in reports:
+        for name, value in report.user_properties:
+            if name == "stability":
+                case, propagation, kind, dtype, law, measured, limit = value
+                numbers = f" {measured:.1e} ≤ {limit:.1e}" if limit else ""
+                rows.setdefault((case, propagation), {})[kind, dtype] = law + numbers
+    columns = [(kind, dtype) for kind in ("image", "gradient") for dtype in ("float64", "float32")]
+    terminalreporter.section("stability")
+    terminalreporter.write_line("| case | propagation | " + " | ".join(map(" ".join, columns)) + " |")
+    terminalreporter.write_line("|---" * (2 + len(columns)) + "|")
+    for (case, propagation), cells in sorted(rows.items()):
+        terminalreporter.write_line(
+            f"| {case} | {propagation} | " + " | ".join(cells.get(c, "") for c in columns) + " |"
+        )

@@ -34,6 +34,7 @@ LAYERS = (
     "space_variant",
     "camera",
     "instrument",
+    "wrap_around",
     "imaging",
     "microscope",
     "weak",

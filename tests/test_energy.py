@@ -162,6 +162,7 @@ def test_weak_absorber_of_any_shape_takes_its_cross_section(propagation, interpo
     torch.testing.assert_close(lost, expected, rtol=1e-3, atol=0)
 
 
+@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
 def test_prisms_two_outputs_share_all_light_in_any_focus(smooth_field, propagation):
     """Without a pupil, bias b and bias b + π add up to the bright field, and no focus plane gains or loses light."""
     grid = Grid((4, 15, 18), (0.4, 0.2, 0.21))

@@ -636,6 +636,7 @@ def test_absent_lenses_leave_matrices_real():
     assert JonesPupil(depolarisation=True).lenses(momentum) is None
 
 
+@pytest.mark.filterwarnings("ignore:objective NA .* is narrower:torchdic.SamplingWarning")
 def test_light_far_outside_the_aperture_spoils_neither_image_nor_gradient():
     """There the losses' exponentials would overflow: NA 0.1 in float32 holds ρ up to 14."""
     size = torch.tensor(0.5, requires_grad=True)

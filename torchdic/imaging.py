@@ -13,6 +13,7 @@ from torchdic.instrument import Acquisition, Microscope
 from torchdic.jones import unpolarised
 from torchdic.jones_pupil import product, turn
 from torchdic.wave import axial_difference, exp_i, paraxial_difference, to_field
+from torchdic.wrap_around import check_wrap_around
 
 # Values per source and pixel that autograd keeps of a pupil of Jones matrices, all of whose terms are learned.
 KEPT_BY_MATRIX = 50
@@ -51,6 +52,8 @@ def form_image(
         if pupil is not None:
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
+    na = background if microscope.objective is None else microscope.objective.na
+    check_wrap_around(spectrum, grid, microscope.wavelength, background, na, plane, momentum, weights, acquisition)
     if not microscope.condenser_prism or microscope.vectorial:
         frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
 

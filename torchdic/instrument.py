@@ -111,8 +111,11 @@ class Acquisition:
         object.__setattr__(self, "focus", tuple(self.focus))
 
 
-def check_apertures(microscope: Microscope, background: float) -> None:
-    """Raise ValueError where an aperture asks for light that the medium's index does not carry."""
+def check_apertures(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> None:
+    """Raise ValueError where an aperture asks for light that the medium's index does not carry.
+
+    dtype: in which p_z = √(n² − |p|²) must be above 0, whatever the rounding of both.
+    """
     condenser = microscope.condenser
     apertures = {"objective": microscope.objective, "condenser": condenser}
     for name, part in apertures.items():
@@ -120,14 +123,14 @@ def check_apertures(microscope: Microscope, background: float) -> None:
             raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
     if condenser is not None:
         largest = condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
-        if largest >= background:
+        if largest >= background * (1 - 4 * torch.finfo(dtype).eps):
             raise ValueError(
                 f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"
             )
 
 
 def check_sampling(microscope: Microscope, grid: Grid) -> None:
-    """Warn with SamplingWarning, on behalf of a caller's caller, where the voxels are coarser than the light."""
+    """Warn with SamplingWarning, on behalf of a caller's caller, where voxels or frequencies are coarser than light."""
     reach = microscope.reach
     coarsest = max((d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=0.0)
     shortest = min(part.wavelength for part, _ in microscope.colours())
@@ -135,6 +138,15 @@ def check_sampling(microscope: Microscope, grid: Grid) -> None:
         warnings.warn(
             f"voxels of {coarsest:g} µm are coarser than λ/(2(NA_o + NA_c)) = "
             f"{shortest / (2 * reach):.3g} µm: the finest detail is lost",
+            SamplingWarning,
+            stacklevel=3,
+        )
+    widest = max((n * d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=math.inf)
+    if microscope.objective is not None and microscope.objective.na < shortest / widest:
+        warnings.warn(
+            f"objective NA {microscope.objective.na:g} is narrower than one frequency of the array, λ/L = "
+            f"{shortest / widest:.3g}: no detail of the specimen passes; a side L above "
+            f"{shortest / microscope.objective.na:.3g} µm holds the first",
             SamplingWarning,
             stacklevel=3,
         )

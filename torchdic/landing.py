@@ -14,13 +14,19 @@ from torch import Tensor
 from torchdic.caustics import tubes_that_may_fold
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.rays import Deviation, axial_momentum, deviation, launch
+from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, launch
 from torchdic.volume import Volume
 
 # Rows and columns of rays traced around the array, from where rays may be bent into it.
 MARGIN = 2
 # Least tube area relative to the unperturbed one: a caustic is bright but finite.
 LEAST_TUBE = 1e-3
+# Array widths by which the outermost rays may be displaced: from farther away none knows the index that it crossed.
+FARTHEST = 2
+
+
+class SidewaysError(ValueError):
+    """Rays that leave the volume sideways: one line with how far they are displaced, and what they may be."""
 
 
 def ray_field(
@@ -39,12 +45,17 @@ def ray_field(
 
     turned: whether rays carry their polarisation. The field is then (source, 2, y, x), its components along +x and +y
     of each ray's local frame for light that comes in along +x: (cos τ, sin τ) times the envelope (see `torchdic.rays`).
+    Raises TurnedRaysError for rays that can't go on toward +z in the volume or behind it, and SidewaysError for rays
+    that come from too far beyond the volume's sides.
     """
     grid, n0 = volume.grid, volume.background
     p0 = momentum[:, None, None, :]
     tubes = tubes_that_may_fold(volume, momentum, fidelity)
     leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity, turn=turned, watch=tubes)
     landed = extend(leaving, p0, n0, plane - grid.extent[0] / 2)
+    trapped = ~torch.isfinite(landed.opd.detach())
+    if bool(trapped.any()):
+        raise TurnedRaysError.of(trapped, "in the medium behind the volume")
     tube = None
     if fidelity.amplitude:
         slant = axial_momentum(n0, p0 + landed.momentum) / axial_momentum(n0, p0)
@@ -125,6 +136,12 @@ class _Mesh:
         rim = torch.ones(my, mx, dtype=torch.bool, device=device)
         rim[1:-1, 1:-1] = False
         farthest = float((displacement.detach()[:, rim] / self.spacing).abs().max())
+        if farthest > FARTHEST * max(my, mx):
+            raise SidewaysError(
+                f"rays leave sideways: at the array's sides they are displaced by up to {farthest:.0f} voxels, more "
+                f"than {FARTHEST} times the {max(my, mx)} that are traced; a wider or thinner volume, or a "
+                "reference_plane nearer to the specimen, may help"
+            )
         extra = max(0, math.ceil(farthest) + 1 - MARGIN)
         self._rows = torch.arange(-extra, my + extra, device=device)
         self._columns = torch.arange(-extra, mx + extra, device=device)

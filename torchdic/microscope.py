@@ -31,7 +31,7 @@ def image(
     Pixels are the volume's (y, x) voxel centres, or those of a camera that has a pixel size. Raises ValueError where an
     aperture exceeds the medium's index; warns with SamplingWarning where the voxels are coarser than the light.
     """
-    check_apertures(microscope, float(volume.background.detach()))
+    check_apertures(microscope, float(volume.background.detach()), volume.delta.dtype)
     check_sampling(microscope, volume.grid)
     if microscope.spectrum is None:
         return _image(volume, microscope, acquisition, fidelity)
@@ -132,11 +132,11 @@ def image_field(
             f"a transmission belongs to one wavelength, the spectrum has {len(microscope.spectrum.wavelengths)}: "
             "sum the images over Microscope.colours()"
         )
-    check_apertures(microscope, float(torch.as_tensor(background, dtype=torch.float64).detach()))
-    check_sampling(microscope, grid)
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))
     real = transmission.real
+    check_apertures(microscope, float(torch.as_tensor(background, dtype=torch.float64).detach()), real.dtype)
+    check_sampling(microscope, grid)
     momentum, weights = microscope.sources(fidelity, dtype=real.dtype, device=real.device)
     expected = (*((len(weights),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:

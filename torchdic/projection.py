@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.rays import axial_momentum
+from torchdic.rays import TurnedRaysError, axial_momentum
 from torchdic.recompute import recompute, slabs
 from torchdic.sampling import SliceSampler, spline_coefficients
 from torchdic.volume import Volume
@@ -20,7 +20,10 @@ from torchdic.volume import Volume
 def project(
     volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
 ) -> Complex[Tensor, "source y x"]:
-    """Each source's envelope as seen at depth `plane` (µm)."""
+    """Each source's envelope as seen at depth `plane` (µm).
+
+    Raises TurnedRaysError where the index on a ray falls below its transverse momentum.
+    """
     grid, n0 = volume.grid, volume.background
     fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
     if fidelity.interpolation == "cubic":
@@ -52,6 +55,9 @@ def project(
     crowded = kept_by_projection(grid, fidelity) * zero.numel() * zero.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
         sums = recompute(cross, first, last, *sums, when=crowded)
+    stopped = ~torch.isfinite(sums[0].detach())
+    if bool(stopped.any()):
+        raise TurnedRaysError.of(stopped)
     k0 = 2 * math.pi / wavelength
     amplitude = torch.ones_like(sums[0]) if len(sums) == 1 else torch.exp(-k0 * sums[1])
     return torch.polar(amplitude, k0 * sums[0])

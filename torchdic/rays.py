@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchdic.fidelity import ADAPTIVE, Fidelity
@@ -37,6 +37,14 @@ from torchdic.volume import Volume
 
 class TurnedRaysError(ValueError):
     """Rays that can't go on toward +z: one line with their number and the law."""
+
+    @classmethod
+    def of(cls, stopped: Bool[Tensor, " *ray"], where: str = "inside the volume") -> "TurnedRaysError":
+        """For rays of which some have stopped, where the index falls to what they carry."""
+        return cls(
+            f"{int(stopped.sum())} of {stopped.numel()} rays can't go on toward +z: "
+            f"{where} the index falls to their transverse momentum"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +164,7 @@ def deviation(
             watch(state[:4].detach())
     stopped = ~torch.isfinite(state[4])
     if bool(stopped.any()):
-        raise TurnedRaysError(
-            f"{int(stopped.sum())} of {stopped.numel()} rays can't go on toward +z: "
-            "inside the volume the index falls to their transverse momentum"
-        )
+        raise TurnedRaysError.of(stopped)
     position, momentum = state[:2].movedim(0, -1), state[2:4].movedim(0, -1)
     absorbed = None if volume.absorption is None else state[5]
     return Deviation(position, momentum, state[4], absorbed, state[-1] if turn else None)

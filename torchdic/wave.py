@@ -5,6 +5,7 @@ f_s = p0/λ. So the envelope of an unperturbed plane wave is 1.
 """
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,8 +27,16 @@ LOWEST_PZ = 0.2
 MOST_ENERGY = 1.1
 
 
+# Energy down to which waves may fall where nothing absorbs: beyond it the slabs lose it to waves that they cut.
+LEAST_ENERGY = 0.9
+
+
 class UnstableError(ValueError):
-    """Slabs too thick for a specimen's contrast: one line with the energy they make and the steps that they have."""
+    """Light that slabs can't carry: one line with the energy they make and their number, or with the index's fall."""
+
+
+class SlabWarning(UserWarning):
+    """Slabs too thick for a specimen's contrast: they lose energy."""
 
 
 def axial_difference(
@@ -94,7 +103,8 @@ def split_step(
     scattering as well as before: with B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen
     φ = k0 dz B/(√(n² − |p0|²) + p_z0), exact for a slab along the source, is followed by the factor
     G² = p_z0/p_z(f + f_s) on what it scatters, to first or second order in φ. Raises UnstableError where the slabs are
-    so thick that this makes energy.
+    so thick that this makes energy, or the index falls below a source's |p0|; warns with SlabWarning where they lose
+    energy though nothing absorbs.
     """
     steps = fidelity.steps or volume.grid.shape[0]
     dz = volume.grid.extent[0] / steps
@@ -142,20 +152,39 @@ def split_step(
     crowded = kept_by_wave(volume.grid, fidelity) * pz.numel() * pz.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
         S = recompute(cross, first, last, S, when=crowded)
-    _check_energy(S.detach(), pz, pz0, volume, steps)
+    _check_energy(S.detach(), pz, volume, momentum, steps)
     return S
 
 
 @torch.no_grad()
-def _check_energy(S: Tensor, pz: Tensor, pz0: Tensor, volume: Volume, steps: int) -> None:
-    """Σ p_z|S|² of each source, p_z0 in front of the specimen, grows where a slab scatters more than there is."""
-    most = float(((pz / pz0) * torch.view_as_real(S).square().sum(-1)).sum((1, 2)).max())
-    if not most <= MOST_ENERGY:
-        low, high = (float(v) for v in torch.aminmax(volume.delta))
+def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps: int) -> None:
+    """Σ p_z|S|² of each source, p_z0 in front of the specimen, grows where a slab scatters more than there is.
+
+    It falls where a slab scatters into evanescent waves, which carry none.
+    """
+    flux = (pz * torch.view_as_real(S).square().sum(-1)).sum((1, 2))
+    least, most = torch.stack(torch.aminmax(flux / axial_momentum(volume.background, momentum))).tolist()
+    lossless = volume.absorption is None
+    if most <= MOST_ENERGY and (least >= LEAST_ENERGY or not lossless):
+        return
+    low, high = (float(v) for v in torch.aminmax(volume.delta))
+    lowest, oblique = float(volume.background) + low, float(momentum.norm(dim=-1).max())
+    thickness = volume.grid.extent[0] / steps
+    if not math.isfinite(most) and lowest <= oblique:
         raise UnstableError(
-            f"slabs of {volume.grid.extent[0] / steps:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind "
+            f"light of n·sinθ {oblique:.6g} can't go on toward +z: inside the volume the index falls to {lowest:.6g}"
+        )
+    if not most <= MOST_ENERGY:
+        raise UnstableError(
+            f"slabs of {thickness:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind "
             f"them the wave has {most:.3g} times the energy that came in; use more than {steps} steps"
         )
+    warnings.warn(
+        f"slabs of {thickness:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind them the wave has "
+        f"{least:.3g} times the energy that came in, and nothing absorbs; use more than {steps} steps",
+        SlabWarning,
+        stacklevel=2,
+    )
 
 
 def kept_by_wave(grid: Grid, fidelity: Fidelity) -> int:
