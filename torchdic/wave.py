@@ -22,7 +22,7 @@ from torchdic.volume import Volume
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
 # beads floors from 0.1 to 0.4 err alike (benchmarks/exact_fields.py); the lower, the thinner the slabs that strong
 # steps of the index want.
-LOWEST_PZ = 0.2
+LOWEST_PZ = 0.3
 # Energy up to which waves may grow, where none can be made: beyond it their growth is the slabs', not the specimen's.
 MOST_ENERGY = 1.1
 
