@@ -199,7 +199,7 @@ def test_slabs_that_make_energy_are_refused_and_thin_ones_are_not():
 
 
 def test_slabs_that_lose_energy_are_warned_about():
-    """A checkerboard scatters far beyond the light: to first order in thick slabs most of it is lost, to second none."""
+    """A checkerboard scatters far beyond the light: to first order thick slabs lose most of it, to second none."""
     index = sum(torch.meshgrid(*map(torch.arange, (16, 48, 48)), indexing="ij"))
     volume = Volume(Grid((16, 48, 48), (0.4, 0.2, 0.2)), 0.05 * (1 - 2 * (index % 2)).double(), N0)
     with pytest.warns(SlabWarning, match=r"slabs of 0.4 µm are too thick .* nothing absorbs; use more than 16 steps"):
