@@ -6,6 +6,9 @@ All sample Δn and its central differences linearly between voxel centres, and s
 first face in one direction.
 """
 
+# the rivals are an extra that a checkout can do without
+# pyright: reportMissingImports=false
+
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
