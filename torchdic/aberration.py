@@ -21,7 +21,6 @@ m = ½ tr M the sharp plane is f = z_e − cosθ·m/(1 − cm).
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -29,8 +28,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchdic.fidelity import ADAPTIVE, AberrationMethod, Fidelity, Solver
-from torchdic.rays import axial_momentum, kept_by_rays
+from torchdic.fidelity import ADAPTIVE, AberrationMethod, Fidelity, Interpolation
+from torchdic.ray_solver import TABLEAUX, equal_steps
+from torchdic.rays import axial_momentum
 from torchdic.recompute import recompute, slabs
 from torchdic.sampling import SliceSampler, spline_coefficients, spline_taps, window
 from torchdic.volume import Volume
@@ -39,15 +39,10 @@ CAREFUL = Fidelity("rays", interpolation="cubic")
 # Rays of a cone: rings at these fractions of its half angle, with so many rays each, in opposite pairs (no coma).
 RINGS = (0.5, 1.0)
 AZIMUTHS = 8
-# `trace` starts at the first face, but object points lie inside, each with more to carry than a ray.
-# Explicit methods whose every stage starts from the one before: (nodes, weights).
-METHODS: dict[Solver, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "euler": ((0,), (1,)),
-    "midpoint": ((0, 1 / 2), (0, 1)),
-    "rk4": ((0, 1 / 2, 1 / 2, 1), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
-}
-# Values per ray and step that autograd keeps of the linear pair for the backward pass.
-KEPT = 1000
+# Values per ray and step that autograd keeps for the backward pass of a ray, and of one that carries the linear pair.
+# (`torchdic.rays` starts at the first face; object points lie inside.)
+KEPT_BY_RAY: dict[Interpolation, int] = {"linear": 110, "cubic": 460}
+KEPT_BY_PAIR = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +168,7 @@ def _check(
         raise ValueError(f"lens at {lens} µm must lie behind the volume, whose last face is at {face:g} µm")
     if fidelity.solver in ADAPTIVE:
         raise ValueError(
-            f"solver {fidelity.solver!r} adapts its steps; curvature takes equal ones: {', '.join(METHODS)}"
+            f"solver {fidelity.solver!r} adapts its steps; curvature takes equal ones: {', '.join(TABLEAUX)}"
         )
     if method not in get_args(AberrationMethod):
         raise ValueError(f"method {method!r} must be one of {', '.join(map(repr, get_args(AberrationMethod)))}")
@@ -233,10 +228,9 @@ def _cross(
     slices = field.unbind(0)
     pz0 = axial_momentum(n0, momentum.movedim(0, -1))
     v = momentum / pz0
-    nodes, weights = METHODS[fidelity.solver]
 
-    def cross(z0: float, z1: float, steps: int, state: Tensor) -> Tensor:
-        near = window(grid, z0, z1, fidelity.interpolation)
+    def cross(first: int, last: int, state: Tensor) -> Tensor:
+        near = window(grid, float(depths[first]), float(depths[last]), fidelity.interpolation)
         sampler = _CurvedSampler(grid, slices[near], fidelity.interpolation, near.start)
 
         def slope(z: float, state: Tensor) -> Tensor:
@@ -260,7 +254,7 @@ def _cross(
                 change += [(((bend[:, :, None] * Q[None]).sum(1) + g[:, None] * k) / pz).flatten(0, 1)]
             return torch.cat(change)
 
-        return _equal_steps(slope, state, z0, z1, steps, nodes, weights)
+        return equal_steps(slope, state, depths[first : last + 1], fidelity.solver)
 
     ray = torch.broadcast_shapes(position.shape[1:], momentum.shape[1:])
     state = position.new_zeros(13 if pair else 5, *ray)
@@ -269,11 +263,12 @@ def _cross(
     whole = fidelity.steps or grid.shape[0]
     # a plane one rounding error above a step's end must not cost another step
     steps = math.ceil(whole * (face - plane) / grid.extent[0] - 1e-9)
-    kept = KEPT * steps if pair else kept_by_rays(grid, fidelity)
+    depths = plane + (face - plane) * torch.arange(steps + 1, dtype=state.dtype) / max(steps, 1)
+    depths[-1] = face
+    kept = steps * (KEPT_BY_PAIR if pair else KEPT_BY_RAY[fidelity.interpolation])
     crowded = kept * state[0].numel() * state.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded) if steps else ():
-        z0, z1 = (plane + (face - plane) * i / steps for i in (first, last))
-        state = recompute(cross, z0, z1, last - first, state, when=crowded)
+        state = recompute(cross, first, last, state, when=crowded)
     # an axial momentum that is not real in the specimen, or in the background behind it
     stopped = ~torch.isfinite(state[4] + axial_momentum(n0, (momentum + state[2:4]).movedim(0, -1)))
     if bool(stopped.any()):
@@ -283,25 +278,6 @@ def _cross(
         )
     Q, P = (state[5:9].unflatten(0, (2, 2)), state[9:].unflatten(0, (2, 2))) if pair else (None, None)
     return _Leaving(state[:2], state[2:4], state[4], Q, P)
-
-
-def _equal_steps(
-    slope: Callable[[float, Tensor], Tensor],
-    state: Tensor,
-    z0: float,
-    z1: float,
-    steps: int,
-    nodes: Sequence[float],
-    weights: Sequence[float],
-) -> Tensor:
-    h = (z1 - z0) / steps
-    for i in range(steps):
-        rate, change = torch.zeros_like(state), torch.zeros_like(state)
-        for node, weight in zip(nodes, weights, strict=True):
-            rate = slope(z0 + (i + node) * h, state + node * h * rate)
-            change = change + weight * rate
-        state = state + h * change
-    return state
 
 
 # --- from the last face to the curvature at the lens -----------------------------------------------------------------

@@ -10,7 +10,7 @@ sampled. (torchdiffeq's odeint_adjoint solves another ODE backward, whose state 
 method's backward pass is autograd's, evaluation by evaluation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count, pairwise
 from typing import Any
@@ -67,6 +67,18 @@ def solve(
         return end
 
 
+def equal_steps(
+    slopes: Callable[[float, Tensor], Tensor],
+    state: Float[Tensor, "component *ray"],
+    depths: Float[Tensor, " depth"],
+    solver: Solver,
+) -> Float[Tensor, "component *ray"]:
+    """The state at the last of some depths by a method of `TABLEAUX`, a step from each depth to the next."""
+    options = {"grid_constructor": lambda *_: depths}
+    path = odeint(lambda z, s: slopes(float(z), s), state, _ends(depths, state), method=solver, options=options)
+    return torch.as_tensor(path[-1])
+
+
 class _EqualSteps(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -82,19 +94,18 @@ class _EqualSteps(torch.autograd.Function):
         kept: list[Tensor] = []
         evaluations = count()
 
-        def slopes(z: Tensor, state: Tensor) -> Tensor:
-            met = equation.meet(float(z), state[:MOVING])
+        def slopes(z: float, state: Tensor) -> Tensor:
+            met = equation.meet(z, state[:MOVING])
             if keep:
                 if next(evaluations) % stages == 0:  # a first stage is where its step begins
                     kept.append(met.moving.clone())  # without the sums beside it
                 kept.extend([met.sampled] if met.kappa is None else [met.sampled, met.kappa])
             return equation.slopes(met)
 
-        options = {"grid_constructor": lambda *_: depths}
-        path = odeint(slopes, state, _ends(depths, state), method=solver, options=options)
+        end = equal_steps(slopes, state, depths, solver)
         ctx.settings = equation, depths, solver
         ctx.save_for_backward(*tensors, *kept)
-        return torch.as_tensor(path[-1])
+        return end
 
     @staticmethod
     @torch.autograd.function.once_differentiable
