@@ -112,20 +112,18 @@ class RayEquation:
             n_bar.addcmul_(met.kappa, kappa_out)
             r_bar.addcmul_(met.kappa, kappa_bar)
         pz_bar = q_bar.clone() if learned else q_bar
-        p_bar = None
+        p, p_bar = dp + self.straight[4:6], None
         if self.turn:
             turn_bar = torch.mul(sums_bar[-1], r).mul_(h).div_(n + pz)
             swept = self._swept(met).mul_(turn_bar)
             pz_bar.sub_(swept)
             n_bar.sub_(swept)
             r_bar.addcmul_(swept, n + pz)
-            p = dp + self.straight[4:6]
             p_bar = torch.stack((-gx, gy)).mul_(turn_bar)
             gradient_bar[0].addcmul_(p[1], turn_bar)
             gradient_bar[1].addcmul_(p[0], turn_bar, value=-1)
         pz_bar.addcmul_(r_bar, r, value=-1).mul_(r)
         n_bar.addcmul_(n, path_bar).addcmul_(n, pz_bar)
-        p = dp + self.straight[4:6]
         p_bar = p.mul_(pz_bar).neg_() if p_bar is None else p_bar.addcmul_(p, pz_bar, value=-1)
 
         y, x = self._positions(z, met.moving)

@@ -36,10 +36,13 @@ class SliceSampler:
     ) -> None:
         self.grid, self.slices, self.first = grid, slices, first
         self.interpolation: Interpolation = interpolation
+        self._around: dict[int, Tensor] = {}
 
     def sample(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, "3 *ray"]:
         """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
-        return self.sample_plane(self.plane(z), y, x)
+        if self.interpolation == "cubic":
+            return self.sample_plane(self.plane(z), y, x)
+        return self._sample_channels(self._channels(z), y, x)
 
     def value(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, " *ray"]:
         """The field alone at depth z and positions (y, x) in µm."""
@@ -61,7 +64,7 @@ class SliceSampler:
         if self.interpolation == "cubic":
             (dy, dx), (value, slope_y, slope_x) = self.grid.spacing[1:], _sample_cubic(field, *self._indices(y, x))
             return torch.stack((value, slope_y / dy, slope_x / dx))
-        return _grid_sample(self._with_slopes(field), self._where(y, x, ring=1)).reshape(3, *y.shape)
+        return self._sample_channels(self._with_slopes(field), y, x)
 
     def value_plane(
         self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
@@ -80,10 +83,9 @@ class SliceSampler:
         """
         learned = any(s.requires_grad for s in self.slices)
         with torch.no_grad():
-            plane = self.plane(z)
             if self.interpolation == "cubic":
-                return _by_autograd(self.sample_plane, plane, y, x, sampled_bar, learned)
-            channels, where = self._with_slopes(plane), self._where(y, x, ring=1)
+                return _by_autograd(self.sample_plane, self.plane(z), y, x, sampled_bar, learned)
+            channels, where = self._channels(z), self._where(y, x, ring=1)
             # what autograd would call, without a second forward pass
             channels_bar, where_bar = torch.ops.aten.grid_sampler_2d_backward(
                 sampled_bar.reshape(1, 3, 1, -1), channels[None], where, 0, 1, True, [learned, True]
@@ -102,6 +104,20 @@ class SliceSampler:
         learned = any(s.requires_grad for s in self.slices)
         with torch.no_grad():
             return _by_autograd(self.value_plane, self.plane(z), y, x, value_bar, learned)
+
+    def _sample_channels(self, channels: Float[Tensor, "3 yy xx"], y: Tensor, x: Tensor) -> Float[Tensor, "3 *ray"]:
+        return _grid_sample(channels, self._where(y, x, ring=1)).reshape(3, *y.shape)
+
+    def _channels(self, z: float) -> Float[Tensor, "3 yy xx"]:
+        """`_with_slopes` of the slice blended for depth z."""
+        if torch.is_grad_enabled():
+            return self._with_slopes(self.plane(z))
+        # the slopes of a blend are the blend of the slopes: those of a slice serve as long as rays are beside it
+        weights = depth_weights(self.grid, z, "linear")
+        known = self._around
+        self._around = {i: known[i] if i in known else self._with_slopes(self.slices[i - self.first]) for i in weights}
+        (channels, *others), (_, *further) = self._around.values(), weights.values()
+        return torch.lerp(channels, others[0], further[0]) if others else channels
 
     def _with_slopes(self, field: Float[Tensor, "y x"]) -> Float[Tensor, "3 yy xx"]:
         """A field and its central differences, on one ring of voxels more."""
