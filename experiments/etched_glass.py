@@ -11,7 +11,6 @@ DIR/etched_glass.png.
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import torch
@@ -52,14 +51,7 @@ def main() -> int:
     for name, (_, lens) in laws.items():
         difference = (images[name] - lens)[:2, 0].abs().max()
         print(f"{name}: the wave's image differs from that of the thin phase by {float(difference):.4f} at most")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        figures.save(draw(images, laws), out / "etched_glass.png")
-    except OSError as error:
-        print(f"etched_glass.py: error: {error}", file=sys.stderr)
-        return 2
-    print(out / "etched_glass.png")
-    return 0
+    return figures.leave(draw(images, laws), out / "etched_glass.png")
 
 
 @torch.no_grad()

@@ -9,7 +9,6 @@ array. Prints the rms difference over the exact image's standard deviation, and 
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import torch
@@ -38,14 +37,7 @@ def main() -> int:
     errors = (modelled - exact).square().mean((1, 2)).sqrt() / exact.std((1, 2), correction=0)
     for focus, error in zip(ACQUISITION.focus, errors.tolist(), strict=True):
         print(f"focus {focus:g} µm: the wave differs from the exact image by {error:.4f} of its standard deviation")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        figures.save(draw(modelled, exact, errors.tolist()), out / "figure1.png")
-    except OSError as error:
-        print(f"figure1.py: error: {error}", file=sys.stderr)
-        return 2
-    print(out / "figure1.png")
-    return 0
+    return figures.leave(draw(modelled, exact, errors.tolist()), out / "figure1.png")
 
 
 @torch.no_grad()

@@ -10,7 +10,6 @@ A plane of focus z_f is sharp not where z = z_f but along the line z + δ = z_f.
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,14 +46,7 @@ def main() -> int:
     maps = {name: aberration_map(delta) for name, delta in objects.items()}
     for name, defocus in maps.items():
         print(f"{name}: δ from {float(defocus.min()):+.2f} to {float(defocus.max()):+.2f} µm")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        figures.save(draw(objects, maps), out / "figure4.png")
-    except OSError as error:
-        print(f"figure4.py: error: {error}", file=sys.stderr)
-        return 2
-    print(out / "figure4.png")
-    return 0
+    return figures.leave(draw(objects, maps), out / "figure4.png")
 
 
 def dented(dent: tuple[tuple[float, float], tuple[float, float]] | None) -> Float[Tensor, "z x"]:

@@ -1,7 +1,6 @@
 """The command line: torchdic demo | simulate | plan | reconstruct | work-precision."""
 
 import argparse
-import json
 import math
 import os
 import signal
@@ -34,7 +33,7 @@ from recon.checkpoint import CheckpointError
 from recon.compare import compare, table
 from recon.config import Config, ConfigError, dump, load, structure
 from recon.descend import Recipe
-from recon.fronts import as_table, draw_fronts, write_csv, write_json
+from recon.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.planned import announce
 from recon.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
 from recon.simulate import exact_images
@@ -54,7 +53,7 @@ from torchdic import (
     plan,
 )
 from torchdic.fidelity import Propagation
-from torchdic.files import written_whole
+from torchdic.files import write_json, write_text
 from torchdic.landing import SidewaysError
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
@@ -148,10 +147,9 @@ def _simulate(options: argparse.Namespace) -> None:
                 planned = plan(volume, microscope, acquisition, config.tolerance)
                 print(announce(planned), flush=True)
                 fidelity = planned.fidelity
-                _write_json(options.out / "plan.json", planned.as_dict())
+                write_json(options.out / "plan.json", planned.as_dict())
                 resolved = replace(config, fidelity=fidelity, tolerance=None)
-                with written_whole(options.out / "config.resolved.toml") as partial:
-                    partial.write_text(f"# {announce(planned)}\n{dump(resolved)}", encoding="utf-8")
+                write_text(options.out / "config.resolved.toml", f"# {announce(planned)}\n{dump(resolved)}")
             images = image(volume, microscope, acquisition, fidelity).cpu()
     pixel = grid.spacing[1:]
     if microscope.camera is not None:
@@ -176,12 +174,7 @@ def _plan(options: argparse.Namespace) -> None:
     planned = plan(Volume(grid, delta, specimen.background), config.microscope, config.acquisition, tolerance)
     print(planned.table())
     if options.out is not None:
-        _write_json(options.out / "plan.json", planned.as_dict())
-
-
-def _write_json(path: Path, values: dict[str, Any]) -> None:
-    with written_whole(path) as partial:
-        partial.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+        write_json(options.out / "plan.json", planned.as_dict())
 
 
 def _reconstruct(options: argparse.Namespace) -> None:
@@ -217,7 +210,7 @@ def _work_precision(options: argparse.Namespace) -> None:
     )
     found = list(tqdm(steps, desc="work-precision", total=len(candidates), unit="candidate"))
     write_csv(options.out / "work_precision.csv", found)
-    write_json(options.out / "work_precision.json", found, reference)
+    write_json(options.out / "work_precision.json", as_dict(found, reference))
     figures.save(draw_fronts({str((config.specimen or {})["kind"]): found}), options.out / "work_precision.png")
     print(as_table(found))
     print(f"\n{options.out / 'work_precision.csv'}, .json and .png: {len(found)} candidates")

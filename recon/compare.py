@@ -1,6 +1,5 @@
 """One stack, reconstructed with each propagation: what accuracy costs."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from recon import figures
 from recon.descend import Recipe, descend
 from recon.metrics import mean_inside, volume_error
 from torchdic import Acquisition, Fidelity, Grid, Microscope
-from torchdic.files import written_whole
+from torchdic.files import write_json
 from torchdic.tiff import write_volume
 
 
@@ -58,8 +57,7 @@ def compare(
         volumes[name] = delta
         write_volume(out / f"{name}.ome.tif", delta, grid)
     figures.save(figures.draw_sections(volumes, grid, ("xy", "xz")), out / "comparison.png")
-    with written_whole(out / "comparison.json") as partial:
-        partial.write_text(json.dumps([asdict(trial) for trial in trials], indent=2) + "\n", encoding="utf-8")
+    write_json(out / "comparison.json", [asdict(trial) for trial in trials])
     return trials
 
 

@@ -1,5 +1,6 @@
 """Pictures of a reconstruction: images beside the model's, sections through the volume, the misfit's way down."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +22,18 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, whole or not at all."""
     with written_whole(path) as partial:
         figure.savefig(partial, dpi=DPI)
+
+
+def leave(figure: Figure, path: Path) -> int:
+    """Save a script's figure in a folder made for it, and print where it is; returns the script's exit code."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
+    except OSError as error:
+        print(f"{Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)
+        return 2
+    print(path)
+    return 0
 
 
 def draw_images(

@@ -1,12 +1,11 @@
-"""Trials of work and precision as files: CSV, JSON, and the fronts as a figure."""
+"""Trials of work and precision as CSV, for JSON, as a table, and their fronts as a figure."""
 
 import csv
-import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -45,17 +44,15 @@ def write_csv(path: Path, trials: Sequence[Trial]) -> None:
             writer.writerow({"name": trial.name, **how, "dtype": trial.candidate.dtype, **found})
 
 
-def write_json(path: Path, trials: Sequence[Trial], reference: Mapping[Propagation, Fidelity]) -> None:
-    """The trials with all options, each propagation's reference, and where they ran."""
-    found = {
+def as_dict(trials: Sequence[Trial], reference: Mapping[Propagation, Fidelity]) -> dict[str, Any]:
+    """What JSON can hold: the trials with all options, each propagation's reference, and where they ran."""
+    return {
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
         "machine": platform.machine(),
         "reference": {propagation: asdict(fidelity) for propagation, fidelity in reference.items()},
         "trials": [asdict(trial) for trial in trials],
     }
-    with written_whole(path) as partial:
-        partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
 
 
 def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str] = ("image", "gradient")) -> Figure:

@@ -2,7 +2,6 @@
 
 import csv
 import hashlib
-import json
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +23,7 @@ from recon.metrics import residual_rms
 from recon.misfit import gaussian, spatial_variance
 from recon.planned import announce_record, current
 from torchdic import Fidelity, Volume, image
-from torchdic.files import written_whole
+from torchdic.files import write_json, write_text, written_whole
 from torchdic.tiff import StackError, read_stack, write_volume
 
 CHECKPOINT = "checkpoint.pt"
@@ -129,8 +128,8 @@ def reconstruct(
         )
     write_volume(out / "volume.ome.tif", delta, grid)
     comments = "".join(f"# {announce_record(record)}\n" for record in plans)
-    _write_text(out / "config.resolved.toml", comments + dump(config))
-    _write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_text(out / "config.resolved.toml", comments + dump(config))
+    write_json(out / "metrics.json", metrics)
     prisms, focus = config.acquisition.prisms, measured.focus
     figures.save(figures.draw_images(data, modelled, prisms, focus, grid), out / "images.png")
     figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
@@ -216,11 +215,6 @@ def _log(path: Path, rows: list[Row]) -> Iterator[Any]:
         writer.writerow(("step", "misfit", "loss", "seconds"))
         writer.writerows(rows)
         yield writer
-
-
-def _write_text(path: Path, text: str) -> None:
-    with written_whole(path) as partial:
-        partial.write_text(text, encoding="utf-8")
 
 
 def _metrics(measured: Measured, modelled: Tensor, data: Tensor, delta: Tensor, last: Step) -> dict[str, object]:

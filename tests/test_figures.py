@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib import image as pictures
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from recon import figures
@@ -213,3 +214,17 @@ def test_the_table_has_a_row_for_each_trial_and_the_truth():
     assert lines[-1].split() == ["truth", "0.000", "0.0300"]
     assert len(lines) == 4
     assert len({len(line) for line in lines[:3]}) == 1
+
+
+def test_a_scripts_figure_makes_its_folder_and_says_where_it_is(tmp_path, capsys):
+    path = tmp_path / "new" / "picture.png"
+    assert figures.leave(Figure(), path) == 0
+    assert capsys.readouterr().out == f"{path}\n"
+    assert pictures.imread(path).ndim == 3
+
+
+def test_a_folder_that_cannot_be_is_one_line_and_exit_2(tmp_path, capsys):
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    assert figures.leave(Figure(), tmp_path / "file" / "picture.png") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert str(tmp_path / "file") in line

@@ -1,9 +1,10 @@
+import json
 import os
 import stat
 
 import pytest
 
-from torchdic.files import written_whole
+from torchdic.files import write_json, write_text, written_whole
 
 
 def test_a_file_appears_whole_at_the_end(tmp_path):
@@ -70,3 +71,17 @@ def test_a_path_may_be_a_string(tmp_path):
     with written_whole(str(tmp_path / "result.txt")) as partial:
         partial.write_text("whole", encoding="utf-8")
     assert (tmp_path / "result.txt").read_text(encoding="utf-8") == "whole"
+
+
+def test_json_and_text_are_what_they_hold(tmp_path):
+    write_text(tmp_path / "text.txt", "Δn µm\n")
+    assert (tmp_path / "text.txt").read_bytes() == "Δn µm\n".encode()
+    write_json(tmp_path / "values.json", {"error": 0.5, "rows": [1, None]})
+    assert json.loads((tmp_path / "values.json").read_text(encoding="utf-8")) == {"error": 0.5, "rows": [1, None]}
+
+
+def test_values_that_json_does_not_know_leave_the_file_as_it_was(tmp_path):
+    write_json(tmp_path / "values.json", [1])
+    with pytest.raises(TypeError):
+        write_json(tmp_path / "values.json", [object()])
+    assert json.loads((tmp_path / "values.json").read_text(encoding="utf-8")) == [1]

@@ -15,7 +15,7 @@ import torch
 from data_synthetic import Bead, GaussianBall
 from recon.cli import main
 from recon.config import converter, dump, load
-from recon.fronts import draw_fronts, write_csv, write_json
+from recon.fronts import as_dict, draw_fronts, write_csv
 from recon.simulate import exact_images
 from torchdic import (
     Acquisition,
@@ -31,6 +31,7 @@ from torchdic import (
     image,
     work_precision,
 )
+from torchdic.files import write_json
 from torchdic.image_error import FLOOR, image_error
 from torchdic.precision import (
     converged_fidelities,
@@ -273,7 +274,7 @@ def some_trials():
 
 
 def test_json_brings_the_trials_back(some_trials, tmp_path):
-    write_json(tmp_path / "t.json", some_trials, {"wave": Fidelity("wave", sources=60)})
+    write_json(tmp_path / "t.json", as_dict(some_trials, {"wave": Fidelity("wave", sources=60)}))
     found = json.loads((tmp_path / "t.json").read_text(encoding="utf-8"))
     assert [converter.structure(trial, Trial) for trial in found["trials"]] == some_trials
     assert found["reference"]["wave"]["sources"] == 60

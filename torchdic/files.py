@@ -1,5 +1,6 @@
 """Files written whole or not at all."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -25,6 +26,17 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """A text file in UTF-8, whole or not at all."""
+    with written_whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike[str], values: object) -> None:
+    """Values that JSON knows, two spaces a level, whole or not at all."""
+    write_text(path, json.dumps(values, indent=2) + "\n")
 
 
 def _umask() -> int:
