@@ -121,7 +121,8 @@ def pytest_terminal_summary(terminalreporter):
         for name, value in report.user_properties:
             if name == "stability":
                 case, propagation, kind, dtype, law, measured, limit = value
-                numbers = f" {measured:.1e} ≤ {limit:.1e}" if limit else ""
+                form = ".4f" if law == "light" else ".1e"
+                numbers = f" {measured:{form}} ≤ {limit:{form}}" if limit else ""
                 rows.setdefault((case, propagation), {})[kind, dtype] = law + numbers
     columns = [(kind, dtype) for kind in ("image", "gradient") for dtype in ("float64", "float32")]
     terminalreporter.section("stability")
