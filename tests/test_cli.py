@@ -1,4 +1,5 @@
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -357,3 +358,22 @@ def test_the_installed_command_answers_with_one_line_and_exit_code_2(write, tmp_
     assert done.stderr.count("\n") == 1
     assert "did you mean 'wavelength'?" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("propagation", "glass", "law"),
+    [
+        ("rays", 1.86, r"rays leave sideways: .* displaced by up to \d+ voxels"),
+        ("rays", 2.16, r"\d+ of 1320 rays can't go on toward \+z: .*; the wave may cross it$"),
+        ("wave", 1.86, r"slabs of 0\.4 µm are too thick for Δn .*; use more than 8 steps$"),
+    ],
+)
+def test_light_that_cannot_be_followed_is_one_line_and_exit_code_2(run, write, propagation, glass, law):
+    grid = {"shape": [8, 16, 18], "spacing": [0.4, 0.2, 0.2], "background": 1.36}
+    wall = {"kind": "etched_glass", "height": 3.2, "glass": glass}
+    lens = {"microscope.objective.na": 0.75, "microscope.condenser.na": 0.6}
+    path = write({"specimen": wall, "volume": grid, "fidelity.propagation": propagation, **lens})
+    code, lines = run("simulate", path)
+    assert code == 2
+    assert len(lines) == 1
+    assert re.search(rf"error: {re.escape(str(path))}: {law}", lines[0])
