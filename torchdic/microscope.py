@@ -13,6 +13,7 @@ from torchdic.grid import Grid
 from torchdic.imaging import form_image, kept_by_imaging
 from torchdic.instrument import Acquisition, Microscope, check_apertures, check_sampling
 from torchdic.landing import ray_field
+from torchdic.passband import interpolate
 from torchdic.projection import kept_by_projection, project
 from torchdic.rays import kept_by_rays
 from torchdic.recompute import sum_over_sources
@@ -164,8 +165,9 @@ def _padded(volume: Volume, pad: int) -> Volume:
 
 
 def _seen(images: Tensor, grid: Grid, pad: int, camera: Camera | None) -> Tensor:
-    """The images without their padding, on the camera's pixels if it has any."""
+    """The images on the grid's pixels without their padding, on the camera's pixels if it has any."""
+    _, ny, nx = grid.shape
+    images = interpolate(images, (ny, nx))
     if camera is not None and camera.pixel_size is not None:
-        _, ny, nx = grid.shape
         return camera.integrate(images, grid.spacing[1:], (ny - 2 * pad, nx - 2 * pad))
     return images if pad == 0 else images[..., pad:-pad, pad:-pad]

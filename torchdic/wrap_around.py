@@ -21,6 +21,7 @@ class WrapAroundWarning(UserWarning):
 @torch.no_grad()
 def check_wrap_around(
     spectrum: Complex[Tensor, "*component source y x"],
+    frequencies: Float[Tensor, "*source 2 y x"],
     grid: Grid,
     wavelength: float,
     background: Tensor,
@@ -33,7 +34,7 @@ def check_wrap_around(
     """Warn with WrapAroundWarning where light from the array's middle has left the array when it comes to a focus.
 
     Over a distance d a wave of momentum p moves sideways by d·p/p_z; the direct light, which is everywhere, apart.
-    spectrum: of what the pupil passes, referred to depth `plane` (µm). The distance is that from `plane` or from the
+    spectrum: of what the pupil passes, at these frequencies (1/µm), referred to depth `plane` (µm). The distance is that from `plane` or from the
     volume's middle, whichever is nearer: a wave is referred to the last face, and back to its middle spreads no more.
     na: the most that |p| can be. Where even that stays within the array, nothing is computed.
     """
@@ -44,7 +45,7 @@ def check_wrap_around(
     steepest = most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
     if not sides or distance == 0 or distance * steepest <= min(sides) / 2:
         return
-    waves = momentum[:, :, None, None] + wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    waves = momentum[:, :, None, None] + wavelength * frequencies
     squared = n0**2 - waves.square().sum(1)
     slope = waves.abs() / torch.where(squared > 0, squared, torch.inf).sqrt()[:, None]
     # voxels by which a wave from the middle has gone beyond the sides; across one voxel there is nowhere to go
@@ -54,7 +55,7 @@ def check_wrap_around(
     light = torch.view_as_real(spectrum).square().sum(-1)
     light = weights[:, None, None] * (light if light.ndim == 3 else light.sum(0))
     total = float(light.sum())
-    light[:, 0, 0] = 0
+    light = torch.where((frequencies == 0).all(-3), 0, light)
     light, beyond = light.flatten(), beyond.flatten()
     part = float(light[beyond > 0].sum()) / total if total > 0 else 0.0
     if part <= UNREMARKED:
