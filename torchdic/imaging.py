@@ -33,8 +33,8 @@ def form_image(
 ) -> Float[Tensor, "prism focus row column"]:
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
 
-    On the grid's pixels, or on fewer that hold it exactly where its pupil passes little of what they hold: `interpolate`
-    then brings it, and with it the sum of several batches of sources, to the grid's.
+    It comes on the grid's pixels or, where the pupil passes little of what these hold, on fewer that hold it exactly:
+    `interpolate` then brings it, and sums of several batches of sources, to the grid's.
 
     Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f if a condenser prism
     makes up for the tilt. Behind a pupil of Jones matrices it is the sum over pure states of the light, each with a D

@@ -9,6 +9,7 @@ brought to the array's by trigonometric interpolation, once for all sources. Bot
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import scipy.fft
 import torch
@@ -54,7 +55,9 @@ class Passband:
         )
         indices = rows[:, :, None] * nx + columns[:, None, :]
         frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device).flatten(1)[:, indices]
-        fine = [min(n, scipy.fft.next_fast_len(2 * width - 1)) for n, width in zip((ny, nx), widths, strict=True)]
+        fine = [
+            min(n, cast(int, scipy.fft.next_fast_len(2 * width - 1))) for n, width in zip((ny, nx), widths, strict=True)
+        ]
         shape = (fine[0], fine[1]) if math.prod(fine) <= WORTHWHILE * ny * nx else (ny, nx)
         return cls(indices, frequencies.movedim(0, 1), shape)
 

@@ -34,9 +34,10 @@ def check_wrap_around(
     """Warn with WrapAroundWarning where light from the array's middle has left the array when it comes to a focus.
 
     Over a distance d a wave of momentum p moves sideways by d·p/p_z; the direct light, which is everywhere, apart.
-    spectrum: of what the pupil passes, at these frequencies (1/µm), referred to depth `plane` (µm). The distance is that from `plane` or from the
-    volume's middle, whichever is nearer: a wave is referred to the last face, and back to its middle spreads no more.
-    na: the most that |p| can be. Where even that stays within the array, nothing is computed.
+    spectrum: of what the pupil passes, referred to depth `plane` (µm), at these frequencies (1/µm). The distance is
+    that from `plane` or from the volume's middle, whichever is nearer: a wave is referred to the last face, and back to
+    its middle spreads no more. na: the most that |p| can be. Where even that stays within the array, nothing is
+    computed.
     """
     depths = [float(torch.as_tensor(focus).detach()) for focus in acquisition.focus]
     distance, farthest = max((min(abs(depth - plane), abs(depth)), depth) for depth in depths)
