@@ -184,11 +184,25 @@ def test_interpolation_is_exact_for_what_the_coarse_array_holds(few, many, dtype
         y, x = (torch.arange(n, dtype=torch.float64) / n for n in shape)
         phases = [2 * math.pi * (j * y[:, None] + k * x) for j, k in terms]
         waves = [a * p.cos() + b * p.sin() for (a, b), p in zip(amplitudes, phases, strict=True)]
-        return torch.stack(waves).sum(0).to(dtype)
+        return (torch.stack(waves).sum(0) + amplitudes.abs().sum()).to(dtype)
 
     expected = sampled(many)
     rounding = 32 * torch.finfo(dtype).eps * float(expected.abs().max())
     torch.testing.assert_close(interpolate(sampled(few), many), expected, rtol=0, atol=rounding)
+
+
+def test_dark_is_dark_on_a_coarse_array_too(dtype):
+    """An empty field at extinction is exactly 0, and no intensity is below it."""
+    y, x = (GRIDS["even"].coordinates(axis, dtype=dtype) for axis in (1, 2))
+    bead = torch.exp(-4j * torch.exp(-8 * (y[:, None] ** 2 + x**2)))
+    acquisition = Acquisition([Prism((0.1, 0.2), 0.0)], [0.0, 1.0])
+    empty, seen = (
+        image_field(field, GRIDS["even"], MICROSCOPES["plain"], acquisition, background=N0)
+        for field in (torch.ones_like(bead), bead)
+    )
+    assert bool((empty == 0).all())
+    assert float(seen.min()) >= 0
+    assert float(seen.max()) > 0.1
 
 
 def test_images_of_the_same_size_are_left_as_they_are():

@@ -67,19 +67,20 @@ class Passband:
         return flat.gather(-1, indices.expand(*flat.shape[:-1], -1)).unflatten(-1, self.indices.shape[1:])
 
 
-def interpolate(images: Float[Tensor, "*image row column"], shape: tuple[int, int]) -> Float[Tensor, "*image y x"]:
-    """Images brought to an array of that shape (y, x), the same along an axis or finer: the polynomials through them.
+def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int, int]) -> Float[Tensor, "*image y x"]:
+    """Intensities at the pixels of an array of that shape (y, x), the same along an axis or finer.
 
-    Exact for frequencies below half of a coarser axis's number of pixels.
+    Of the trigonometric polynomial through them: exact for frequencies below half of a coarser axis's number of pixels.
     """
-    (rows, columns), (ny, nx) = images.shape[-2:], shape
+    (rows, columns), (ny, nx) = intensity.shape[-2:], shape
     if (rows, columns) == (ny, nx):
-        return images
-    spectrum = torch.fft.rfft2(images, norm="forward")
+        return intensity
+    spectrum = torch.fft.rfft2(intensity, norm="forward")
     if columns < nx:
         spectrum = spectrum[..., : (columns + 1) // 2]
     if rows < ny:
         half = (rows - 1) // 2
         nothing = spectrum.new_zeros(*spectrum.shape[:-2], ny - 2 * half - 1, spectrum.shape[-1])
         spectrum = torch.cat((spectrum[..., : half + 1, :], nothing, spectrum[..., rows - half :, :]), -2)
-    return torch.fft.irfft2(spectrum, s=(ny, nx), norm="forward")
+    # what is dark may come out below 0 by rounding
+    return torch.fft.irfft2(spectrum, s=(ny, nx), norm="forward").clamp_min(0)
