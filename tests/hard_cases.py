@@ -374,6 +374,11 @@ CASES = [
         warned=everywhere(WRAPS),
     ),
     Case(
+        "focus 500 µm away, band-limited",
+        lambda: Scene(smooth(0.02), values=value(focus=500.0), options={"band_limit": True}),
+        warned=everywhere((WrapAroundWarning, r"focus 500 µm .* of the light leaves the array and is cut")),
+    ),
+    Case(
         "pupil below a frequency bin",
         lambda: Scene(smooth(0.02), na=0.01, na_c=0.0, sources=((0.0, 0.0),)),
         warned=everywhere((SamplingWarning, r"NA 0.01 is narrower than one frequency .* a side L above 54.6 µm")),

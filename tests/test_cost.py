@@ -240,6 +240,7 @@ ABSENT = {
     "padding": ({}, {"padding": 0}),
     "object-aberration": ({}, {"object_aberration": None}),
     "exact-defocus": ({}, {"defocus": "exact"}),
+    "band-limit": ({}, {"band_limit": False}),
     "absorption": ({}, {"absorption": None}),
 }
 
@@ -328,6 +329,14 @@ def test_paraxial_defocus_costs_no_transform(delta, counted, propagation):
     exact, paraxial = (taking(delta, propagation=propagation, defocus=d) for d in ("exact", "paraxial"))
     assert counted(exact) == counted(paraxial)
     assert float((exact() - paraxial()).abs().max()) > 1e-4
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+def test_band_limit_costs_no_transform(delta, counted, propagation):
+    far = Acquisition(ACQUISITION.prisms, [60.0, -9.0])
+    periodic, limited = (taking(delta, SCOPE, far, propagation, band_limit=limit) for limit in (False, True))
+    assert counted(periodic) == counted(limited)
+    assert float((periodic() - limited()).abs().max()) > 1e-4
 
 
 def test_caustics_are_not_counted_where_a_bound_rules_them_out(delta, counted, monkeypatch):

@@ -14,7 +14,7 @@ from torchdic.jones import unpolarised
 from torchdic.jones_pupil import product, turn
 from torchdic.passband import Passband
 from torchdic.wave import axial_difference, exp_i, paraxial_difference, to_field
-from torchdic.wrap_around import check_wrap_around
+from torchdic.wrap_around import Spread, check_wrap_around
 
 # Values per source and pixel that autograd keeps of a pupil of Jones matrices, all of whose terms are learned.
 KEPT_BY_MATRIX = 50
@@ -30,6 +30,8 @@ def form_image(
     microscope: Microscope,
     acquisition: Acquisition,
     defocus: Defocus = "exact",
+    *,
+    band_limit: bool = False,
 ) -> Float[Tensor, "prism focus row column"]:
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
 
@@ -61,7 +63,8 @@ def form_image(
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
     na = background if objective is None else objective.na
-    check_wrap_around(spectrum, frequencies, grid, wavelength, background, na, plane, momentum, weights, acquisition)
+    spread = Spread(grid, wavelength, background, na, plane, momentum, frequencies)
+    check_wrap_around(spectrum, spread, weights, acquisition, cut=band_limit)
     if not microscope.condenser_prism or microscope.vectorial:
         frequencies = frequencies + momentum[:, :, None, None] / wavelength
     shape = grid.shape[1:] if band is None else band.shape
@@ -69,7 +72,8 @@ def form_image(
 
     def sharp(focus: float | Tensor) -> Tensor:
         depth = torch.as_tensor(focus, dtype=difference.dtype, device=difference.device)
-        return spectrum * exp_i(k0 * (depth - plane) * difference)
+        wave = spectrum * exp_i(k0 * (depth - plane) * difference)
+        return spread.cut(wave, focus) if band_limit else wave
 
     if microscope.vectorial:
         transfers = _state_transfers(frequencies, passes, momentum, background, microscope, acquisition, turned)
