@@ -63,8 +63,9 @@ class Passband:
 
     def window(self, spectrum: Complex[Tensor, "*component source y x"]) -> Complex[Tensor, "*component source v u"]:
         """Each source's spectrum within its window."""
-        flat, indices = spectrum.flatten(-2), self.indices.flatten(1)
-        return flat.gather(-1, indices.expand(*flat.shape[:-1], -1)).unflatten(-1, self.indices.shape[1:])
+        # an index keeps less than `gather` does, whose backward pass holds on to the whole spectrum
+        sources = torch.arange(len(self.indices), device=spectrum.device)[:, None, None]
+        return spectrum.flatten(-2)[..., sources, self.indices]
 
 
 def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int, int]) -> Float[Tensor, "*image y x"]:
