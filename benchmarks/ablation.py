@@ -27,6 +27,7 @@ from torchdic import Fidelity, Grid, Volume, image, image_field, landing
 from torchdic.aberration import effective_defocus
 from torchdic.fidelity import AberrationMethod
 from torchdic.imaging import form_image
+from torchdic.passband import interpolate
 from torchdic.projection import project
 from torchdic.rays import Deviation, axial_momentum
 from torchdic.space_variant import levels
@@ -117,7 +118,7 @@ def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMet
         at_plane = field(volume, microscope.wavelength, momentum, plane, rays)
         spectrum = levels(defocus, rate).spread(at_plane, microscope.wavelength, difference)
         images = form_image(spectrum, volume.grid, n0, plane, momentum, weights, microscope, scene.acquisition)
-    return scene.errors(images)
+    return scene.errors(interpolate(images, (volume.grid.shape[1], volume.grid.shape[2])))
 
 
 def print_row(label: str, errors: Callable[[], list[float]]) -> None:

@@ -35,6 +35,7 @@ LAYERS = (
     "camera",
     "instrument",
     "wrap_around",
+    "passband",
     "imaging",
     "microscope",
     "weak",

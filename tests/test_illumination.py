@@ -239,8 +239,8 @@ def test_transforms_are_those_of_propagation_and_of_each_prism_and_focus(
     assert transforms(lambda: image(volume, scope, acquisition, Fidelity("projection"))) == factor * (1 + 6)
 
 
-def test_absent_effects_leave_the_image_bit_for_bit(volume, acquisition, propagation, dtype):
-    """Written out without any of them: aperture, aberrations, exact defocus, shear and bias."""
+def test_absent_effects_leave_the_image_to_its_rounding(volume, acquisition, propagation, dtype):
+    """Written out on the whole array without any of them: aperture, aberrations, exact defocus, shear and bias."""
     volume = Volume(volume.grid, volume.delta.to(dtype), N0)
     scope, fidelity = Microscope(0.546, Objective(0.75, {4: 0.3, 7: -0.2}), Condenser(0.4)), Fidelity(propagation)
     momentum, weights = scope.sources(fidelity, dtype=dtype, device=torch.device("cpu"))
@@ -257,4 +257,5 @@ def test_absent_effects_leave_the_image_bit_for_bit(volume, acquisition, propaga
         for p, prism in enumerate(acquisition.prisms):
             field = to_field(sharp if prism is None else sharp * prism.transfer(frequencies))
             expected = torch.tensordot(weights, torch.view_as_real(field).square(), 1).sum(-1)
-            assert torch.equal(found[p, f], expected)
+            # images of about 1, each a sum over 40 sources of transforms in another order
+            torch.testing.assert_close(found[p, f], expected, rtol=0, atol=16 * torch.finfo(dtype).eps)

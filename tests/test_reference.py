@@ -25,19 +25,24 @@ def contrast_error(images, expected):
     return difference / expected.double().std((-1, -2), correction=0)
 
 
-def thin(data, specimen, planes, defocus="exact"):
-    """Largest differences from the reference, (2, plane): of DIC and of bright field."""
+def thin(data, specimen, planes, defocus="exact", rings=None):
+    """Largest differences from the reference, (2, plane): of DIC and of bright field.
+
+    rings: so many directions of our own, of the second moment of the reference's, in place of all of these.
+    """
     transmission = data[f"object_{specimen}"]
     spacing = float(data["spacing"])
     grid = Grid((1, *transmission.shape), (1.0, spacing, spacing))
-    microscope = Microscope(
-        float(data["wavelength"]),
-        Objective(float(data["na_objective"])),
-        Condenser(float(data["na_condenser"]), points=data["source_na_yx"]),
+    points = data["source_na_yx"]
+    condenser = (
+        Condenser(float(data["na_condenser"]), points=points)
+        if rings is None
+        else Condenser(float((2 * points.square().sum(1).mean()).sqrt()))
     )
+    microscope = Microscope(float(data["wavelength"]), Objective(float(data["na_objective"])), condenser)
     prism = Prism(tuple(data["shear_yx"].tolist()), float(data["bias"]))
     acquisition = Acquisition([prism, None], data["focus_paraxial"][planes].tolist())
-    fidelity = Fidelity(defocus=defocus)
+    fidelity = Fidelity(defocus=defocus, sources=rings or 40)
     images = image_field(
         transmission, grid, microscope, acquisition, background=float(data["n_medium"]), fidelity=fidelity
     )
@@ -51,6 +56,23 @@ def test_thin_object_agrees_with_the_reference_implementation(load, specimen):
     in_focus = data["focus_paraxial"].tolist().index(0.0)
     # the reference summed in single precision: 1e-6 for DIC, 2e-6 for bright field
     assert float(thin(data, specimen, [in_focus]).max()) < 2e-6
+
+
+@pytest.mark.parametrize(("specimen", "rings"), [("gauss", 24), ("asym", 24), ("asym", 40)])
+def test_few_directions_on_rings_stand_in_for_the_references_437_in_dic(load, specimen, rings):
+    data = load("thin_dic")
+    in_focus = data["focus_paraxial"].tolist().index(0.0)
+    dic, _ = thin(data, specimen, [in_focus], rings=rings)
+    assert float(dic.max()) < 2e-4
+
+
+def test_bright_field_of_an_object_that_reaches_the_pupils_edge_takes_more_directions(load):
+    """What the square grid itself errs by, 1.1e-4, is the least that rings can differ from it."""
+    data = load("thin_dic")
+    in_focus = data["focus_paraxial"].tolist().index(0.0)
+    few, more, many = (float(thin(data, "asym", [in_focus], rings=n)[1].max()) for n in (24, 80, 1000))
+    assert few > 2 * more > 2 * many
+    assert many == pytest.approx(1.2e-4, rel=0.2)
 
 
 @pytest.mark.parametrize("specimen", ["gauss", "asym"])

@@ -30,6 +30,9 @@ class Fidelity:
     order: of the split step: 2 (4 FFTs a slab) or 1 (2 FFTs).
     defocus: from where light leaves the specimen to the plane of focus: "exact", by p_z − p_z0, or "paraxial", by
         −(|p|² − |p0|²)/(2n0), as earlier models have it; inside the specimen waves are exact in either case.
+    band_limit: whether waves that leave the array on their way to a focus are cut, as is right for a specimen that
+        stands alone, and cheaper than the padding that holds them; otherwise they come back in at the opposite side, as
+        is right for a periodic one. A WrapAroundWarning names their part of the light in either case.
     object_aberration: how the specimen's own defocus of each object point is found, with which it then spreads
         (Kagalwala & Kanade, Eq. 6): "linear" around an axial ray, "cone" over the condenser's aperture; None leaves it
         out. Found once an image, by rk4 in `steps` through a cubic spline. It stands in for the amplitude that straight
@@ -50,6 +53,7 @@ class Fidelity:
     amplitude: bool = True
     order: Literal[1, 2] = 2
     defocus: Defocus = "exact"
+    band_limit: bool = False
     object_aberration: AberrationMethod | None = None
     reference_plane: float | None = None
     padding: int = 0

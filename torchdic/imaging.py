@@ -12,8 +12,9 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope
 from torchdic.jones import unpolarised
 from torchdic.jones_pupil import product, turn
+from torchdic.passband import Passband
 from torchdic.wave import axial_difference, exp_i, paraxial_difference, to_field
-from torchdic.wrap_around import check_wrap_around
+from torchdic.wrap_around import Spread, check_wrap_around
 
 # Values per source and pixel that autograd keeps of a pupil of Jones matrices, all of whose terms are learned.
 KEPT_BY_MATRIX = 50
@@ -29,37 +30,50 @@ def form_image(
     microscope: Microscope,
     acquisition: Acquisition,
     defocus: Defocus = "exact",
-) -> Float[Tensor, "prism focus y x"]:
+    *,
+    band_limit: bool = False,
+) -> Float[Tensor, "prism focus row column"]:
     """Σ over sources of weight·|F⁻¹[D·pupil·defocus·S]|², the spectra S referred to depth `plane` (µm).
+
+    It comes on the grid's pixels or, where the pupil passes little of what these hold, on fewer that hold it exactly:
+    `interpolate` then brings it, and sums of several batches of sources, to the grid's.
 
     Pupil and defocus act on the field's frequency f + f_s, the prism's shear on the envelope's f if a condenser prism
     makes up for the tilt. Behind a pupil of Jones matrices it is the sum over pure states of the light, each with a D
     of its own, see `Polarisation.transfers`. spectrum: with the components of `propagate` where rays are turned.
     """
-    k0 = 2 * math.pi / microscope.wavelength
-    frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
-    difference, pz = axial_difference(grid, microscope.wavelength, background, momentum)
-    passes = pz > 0
-    if defocus == "paraxial":
-        difference = paraxial_difference(grid, microscope.wavelength, background, momentum)
+    wavelength, objective = microscope.wavelength, microscope.objective
     turned = spectrum.ndim == 4
     if turned:
         spectrum = spectrum.movedim(1, 0)
-    if microscope.objective is not None:
-        waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
-        passes = passes & microscope.objective.aperture(waves)
-        pupil = microscope.objective.transfer(waves, momentum, microscope.wavelength, background)
+    band = None if objective is None else Passband.around(grid, wavelength, objective.na, momentum)
+    if band is None:
+        frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    else:
+        spectrum, frequencies = band.window(spectrum), band.frequencies
+    difference, pz = axial_difference(grid, wavelength, background, momentum, frequencies)
+    passes = pz > 0
+    if defocus == "paraxial":
+        difference = paraxial_difference(grid, wavelength, background, momentum, frequencies)
+    if objective is not None:
+        waves = momentum[:, :, None, None] + wavelength * frequencies
+        passes = passes & objective.aperture(waves)
+        pupil = objective.transfer(waves, momentum, wavelength, background)
         if pupil is not None:
             spectrum = spectrum * pupil
     spectrum = torch.where(passes, spectrum, 0)
-    na = background if microscope.objective is None else microscope.objective.na
-    check_wrap_around(spectrum, grid, microscope.wavelength, background, na, plane, momentum, weights, acquisition)
+    na = background if objective is None else objective.na
+    spread = Spread(grid, wavelength, background, na, plane, momentum, frequencies)
+    check_wrap_around(spectrum, spread, weights, acquisition, cut=band_limit)
     if not microscope.condenser_prism or microscope.vectorial:
-        frequencies = frequencies + momentum[:, :, None, None] / microscope.wavelength
+        frequencies = frequencies + momentum[:, :, None, None] / wavelength
+    shape = grid.shape[1:] if band is None else band.shape
+    k0 = 2 * math.pi / wavelength
 
     def sharp(focus: float | Tensor) -> Tensor:
         depth = torch.as_tensor(focus, dtype=difference.dtype, device=difference.device)
-        return spectrum * exp_i(k0 * (depth - plane) * difference)
+        wave = spectrum * exp_i(k0 * (depth - plane) * difference)
+        return spread.cut(wave, focus) if band_limit else wave
 
     if microscope.vectorial:
         transfers = _state_transfers(frequencies, passes, momentum, background, microscope, acquisition, turned)
@@ -67,17 +81,17 @@ def form_image(
         for focus in acquisition.focus:
             wave = sharp(focus)
             for shares, transfer in transfers:
-                field = to_field((transfer * wave).sum(1))
+                field = to_field((transfer * wave).sum(1), shape)
                 images.append(torch.einsum("tsyxc,s,t->yx", torch.view_as_real(field).square(), weights, shares))
     else:
-        images = _scalar_images(sharp, frequencies, weights, microscope, acquisition)
-    shape = (len(acquisition.focus), len(acquisition.prisms), *grid.shape[1:])
-    return torch.stack(images).reshape(shape).transpose(0, 1)
+        images = _scalar_images(sharp, frequencies, shape, weights, microscope, acquisition)
+    return torch.stack(images).unflatten(0, (len(acquisition.focus), len(acquisition.prisms))).transpose(0, 1)
 
 
 def _scalar_images(
     sharp: Callable[[float | Tensor], Tensor],
     frequencies: Tensor,
+    shape: tuple[int, int],
     weights: Tensor,
     microscope: Microscope,
     acquisition: Acquisition,
@@ -91,12 +105,12 @@ def _scalar_images(
     for focus in acquisition.focus:
         wave = sharp(focus)
         for prism, transfer in zip(acquisition.prisms, transfers, strict=True):
-            field = to_field(wave if transfer is None else wave * transfer)
+            field = to_field(wave if transfer is None else wave * transfer, shape)
             if prism is None or polarisation is None:
                 # over the sources first: a sum over two neighbours in memory is slow
                 images.append(torch.tensordot(weights, torch.view_as_real(field).square(), 1).sum(-1))
             else:
-                stopped = to_field(wave * prism.parallel(frequencies))
+                stopped = to_field(wave * prism.parallel(frequencies), shape)
                 images.append(torch.einsum("syx,s->yx", polarisation.intensity(field, stopped, prism.bias), weights))
     return images
 

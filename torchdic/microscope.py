@@ -13,6 +13,7 @@ from torchdic.grid import Grid
 from torchdic.imaging import form_image, kept_by_imaging
 from torchdic.instrument import Acquisition, Microscope, check_apertures, check_sampling
 from torchdic.landing import ray_field
+from torchdic.passband import interpolate
 from torchdic.projection import kept_by_projection, project
 from torchdic.rays import kept_by_rays
 from torchdic.recompute import sum_over_sources
@@ -71,6 +72,7 @@ def _image(
             microscope,
             acquisition,
             fidelity.defocus,
+            band_limit=fidelity.band_limit,
         )
 
     components = 2 if microscope.turns and fidelity.propagation == "rays" else 1
@@ -147,7 +149,10 @@ def image_field(
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-        return form_image(spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition, fidelity.defocus)
+        return form_image(
+            spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition, fidelity.defocus,
+            band_limit=fidelity.band_limit,
+        )  # fmt: skip
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
     kept = kept_by_imaging(microscope, acquisition)
@@ -164,8 +169,9 @@ def _padded(volume: Volume, pad: int) -> Volume:
 
 
 def _seen(images: Tensor, grid: Grid, pad: int, camera: Camera | None) -> Tensor:
-    """The images without their padding, on the camera's pixels if it has any."""
+    """The images on the grid's pixels without their padding, on the camera's pixels if it has any."""
+    _, ny, nx = grid.shape
+    images = interpolate(images, (ny, nx))
     if camera is not None and camera.pixel_size is not None:
-        _, ny, nx = grid.shape
         return camera.integrate(images, grid.spacing[1:], (ny - 2 * pad, nx - 2 * pad))
     return images if pad == 0 else images[..., pad:-pad, pad:-pad]

@@ -40,13 +40,18 @@ class SlabWarning(UserWarning):
 
 
 def axial_difference(
-    grid: Grid, wavelength: float, background: Tensor, momentum: Float[Tensor, "source 2"]
+    grid: Grid,
+    wavelength: float,
+    background: Tensor,
+    momentum: Float[Tensor, "source 2"],
+    frequencies: Float[Tensor, "*source 2 y x"] | None = None,
 ) -> tuple[Float[Tensor, "source y x"], Float[Tensor, "source y x"]]:
     """p_z(f + f_s) − p_z0 and p_z(f + f_s) of each source's waves; p_z is 0 where a wave is evanescent.
 
-    The difference is formed without cancellation, so float32 keeps the phase of a long path.
+    frequencies: f in 1/µm; None is all of the grid's. The difference is formed without cancellation, so float32 keeps
+    the phase of a long path.
     """
-    deflection = wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    deflection = wavelength * _frequencies(grid, momentum, frequencies)
     p0 = momentum[:, :, None, None]
     pz0 = axial_momentum(background, momentum)[:, None, None]
     squared = background**2 - (p0 + deflection).square().sum(1)
@@ -57,11 +62,19 @@ def axial_difference(
 
 
 def paraxial_difference(
-    grid: Grid, wavelength: float, background: Tensor, momentum: Float[Tensor, "source 2"]
+    grid: Grid,
+    wavelength: float,
+    background: Tensor,
+    momentum: Float[Tensor, "source 2"],
+    frequencies: Float[Tensor, "*source 2 y x"] | None = None,
 ) -> Float[Tensor, "source y x"]:
-    """−(|p|² − |p0|²)/(2n0), p_z − p_z0 to second order in the momenta p at f + f_s."""
-    deflection = wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
+    """−(|p|² − |p0|²)/(2n0), p_z − p_z0 to second order in the momenta p at f + f_s; frequencies: see above."""
+    deflection = wavelength * _frequencies(grid, momentum, frequencies)
     return -(deflection * (deflection + 2 * momentum[:, :, None, None])).sum(1) / (2 * background)
+
+
+def _frequencies(grid: Grid, momentum: Tensor, given: Tensor | None) -> Tensor:
+    return grid.frequencies(dtype=momentum.dtype, device=momentum.device) if given is None else given
 
 
 def exp_i(phase: Tensor) -> Tensor:
@@ -89,9 +102,9 @@ def to_spectrum(field: Tensor) -> Tensor:
     return torch.fft.fft2(field, norm="forward")
 
 
-def to_field(spectrum: Tensor) -> Tensor:
-    """The field (…, y, x) of the plane waves in a spectrum."""
-    return torch.fft.ifft2(spectrum, norm="forward")
+def to_field(spectrum: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
+    """The field (…, y, x) of the plane waves in a spectrum, which zeros make up to `shape`."""
+    return torch.fft.ifft2(spectrum, s=shape, norm="forward")
 
 
 def split_step(

@@ -1,10 +1,17 @@
-"""Far from focus light spreads beyond the array's sides, and comes back in at the opposite ones."""
+"""Far from focus light spreads beyond the array's sides, and comes back in at the opposite ones unless it is cut.
+
+The array is periodic, and what is computed is exact for a specimen that is: light that moves sideways by more than half
+the array comes, where a specimen stands alone, from its images outside. Without these waves the transfer function is
+the band-limited one of Matsushima & Shimobaba, Opt. Express 17, 19662 (2009): they are those whose phase turns by more
+than π from one frequency of the array to the next.
+"""
 
 import math
 import warnings
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from torchdic.grid import Grid
@@ -15,56 +22,96 @@ UNREMARKED = 1e-4
 
 
 class WrapAroundWarning(UserWarning):
-    """A focus so far from the specimen that its light wraps around the array."""
+    """A focus so far from the specimen that its light leaves the array, to wrap around or to be cut."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """How far each source's waves go sideways on their way to a focus.
+
+    frequencies: of the envelopes' waves in 1/µm. na: the most that |p| of a wave can be. plane: depth in µm to which
+    spectra are referred.
+    """
+
+    grid: Grid
+    wavelength: float
+    background: Tensor
+    na: float | Tensor
+    plane: float
+    momentum: Float[Tensor, "source 2"]
+    frequencies: Float[Tensor, "*source 2 y x"]
+
+    def distance(self, focus: float | Tensor) -> float:
+        """Of a focus in µm: from `plane` or from the volume's middle, whichever is nearer.
+
+        A wave is referred to the last face, and back to its middle spreads no more.
+        """
+        depth = float(torch.as_tensor(focus).detach())
+        return min(abs(depth - self.plane), abs(depth))
+
+    @torch.no_grad()
+    def beyond(self, distance: float) -> Float[Tensor, "source y x"] | None:
+        """Voxels by which each wave from the array's middle has gone beyond its sides; None where none can have.
+
+        Over a distance d a wave of momentum p moves sideways by d·p/p_z.
+        """
+        n0, most = float(self.background), float(self.na)
+        shape, spacing = self.grid.shape[1:], self.grid.spacing[1:]
+        sides = [n * d for n, d in zip(shape, spacing, strict=True) if n > 1]
+        steepest = most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
+        if not sides or distance == 0 or distance * steepest <= min(sides) / 2:
+            return None
+        waves = self.momentum[:, :, None, None] + self.wavelength * self.frequencies
+        squared = n0**2 - waves.square().sum(1)
+        slope = waves.abs() / torch.where(squared > 0, squared, torch.inf).sqrt()[:, None]
+        size, voxel = (waves.new_tensor(v)[:, None, None] for v in (shape, spacing))
+        # across one voxel there is nowhere to go
+        return torch.where(size > 1, distance * slope / voxel - size / 2, -torch.inf).amax(1)
+
+    @property
+    def direct(self) -> Bool[Tensor, "*source y x"]:
+        """Which waves are the sources' own, which are everywhere and so leave no array."""
+        return (self.frequencies == 0).all(-3)
+
+    def cut(
+        self, waves: Complex[Tensor, "*component source y x"], focus: float | Tensor
+    ) -> Complex[Tensor, "*component source y x"]:
+        """The waves at a focus without those that have left the array."""
+        beyond = self.beyond(self.distance(focus))
+        return waves if beyond is None else torch.where((beyond > 0) & ~self.direct, 0, waves)
 
 
 @torch.no_grad()
 def check_wrap_around(
     spectrum: Complex[Tensor, "*component source y x"],
-    grid: Grid,
-    wavelength: float,
-    background: Tensor,
-    na: float | Tensor,
-    plane: float,
-    momentum: Float[Tensor, "source 2"],
+    spread: Spread,
     weights: Float[Tensor, " source"],
     acquisition: Acquisition,
+    *,
+    cut: bool,
 ) -> None:
     """Warn with WrapAroundWarning where light from the array's middle has left the array when it comes to a focus.
 
-    Over a distance d a wave of momentum p moves sideways by d·p/p_z; the direct light, which is everywhere, apart.
-    spectrum: of what the pupil passes, referred to depth `plane` (µm). The distance is that from `plane` or from the
-    volume's middle, whichever is nearer: a wave is referred to the last face, and back to its middle spreads no more.
-    na: the most that |p| can be. Where even that stays within the array, nothing is computed.
+    spectrum: of what the pupil passes. cut: whether that light is cut. Where nothing can leave, nothing is computed.
     """
-    depths = [float(torch.as_tensor(focus).detach()) for focus in acquisition.focus]
-    distance, farthest = max((min(abs(depth - plane), abs(depth)), depth) for depth in depths)
-    n0, most = float(background), float(na)
-    sides = [n * d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1]
-    steepest = most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
-    if not sides or distance == 0 or distance * steepest <= min(sides) / 2:
+    distance, farthest = max((spread.distance(focus), float(torch.as_tensor(focus))) for focus in acquisition.focus)
+    beyond = spread.beyond(distance)
+    if beyond is None:
         return
-    waves = momentum[:, :, None, None] + wavelength * grid.frequencies(dtype=momentum.dtype, device=momentum.device)
-    squared = n0**2 - waves.square().sum(1)
-    slope = waves.abs() / torch.where(squared > 0, squared, torch.inf).sqrt()[:, None]
-    # voxels by which a wave from the middle has gone beyond the sides; across one voxel there is nowhere to go
-    size, spacing = (momentum.new_tensor(v)[:, None, None] for v in (grid.shape[1:], grid.spacing[1:]))
-    beyond = distance * slope / spacing - size / 2
-    beyond = torch.where(size > 1, beyond, -torch.inf).amax(1)
     light = torch.view_as_real(spectrum).square().sum(-1)
     light = weights[:, None, None] * (light if light.ndim == 3 else light.sum(0))
     total = float(light.sum())
-    light[:, 0, 0] = 0
-    light, beyond = light.flatten(), beyond.flatten()
+    light, beyond = torch.where(spread.direct, 0, light).flatten(), beyond.flatten()
     part = float(light[beyond > 0].sum()) / total if total > 0 else 0.0
     if part <= UNREMARKED:
         return
     order = beyond.argsort(descending=True)
     kept = light[order].cumsum(0) > UNREMARKED * total
     padding = math.ceil(float(beyond[order][kept].amax()))
+    fate = "is cut" if cut else "comes back in at the opposite side"
     warnings.warn(
         f"focus {farthest:g} µm lies {distance:g} µm from the specimen: {100 * part:.2g} % of the light "
-        f"leaves the array and comes back in at the opposite side; {padding} more voxels of padding would hold it",
+        f"leaves the array and {fate}; {padding} more voxels of padding would hold it",
         WrapAroundWarning,
         stacklevel=2,
     )
