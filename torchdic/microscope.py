@@ -149,10 +149,8 @@ def image_field(
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-        return form_image(
-            spectra, grid, n0, 0.0, momentum, weights, microscope, acquisition, fidelity.defocus,
-            band_limit=fidelity.band_limit,
-        )  # fmt: skip
+        scene = microscope, acquisition, fidelity.defocus
+        return form_image(spectra, grid, n0, 0.0, momentum, weights, *scene, band_limit=fidelity.band_limit)
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
     kept = kept_by_imaging(microscope, acquisition)
