@@ -33,7 +33,8 @@ from torchdic import (
     plan,
 )
 from torchdic.image_error import FLOOR, image_error
-from torchdic.plan import describe, work
+from torchdic.cost import work
+from torchdic.plan import describe
 from torchdic.tiff import read_volume
 
 GRID = Grid((16, 48, 48), (0.4, 0.2, 0.2))

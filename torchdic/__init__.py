@@ -18,7 +18,8 @@ from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
-from torchdic.plan import Effect, Plan, ToleranceWarning, plan
+from torchdic.effects import Effect
+from torchdic.plan import Plan, ToleranceWarning, plan
 from torchdic.precision import Candidate, Trial, work_precision
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace

@@ -1,0 +1,132 @@
+"""A scene, and the smaller ones that stand for it: its busiest window, its hardest images, few of its sources."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdic.condenser import Condenser
+from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
+from torchdic.instrument import Acquisition, Microscope
+from torchdic.microscope import image
+from torchdic.volume import Volume
+
+# Voxels along each side of a pilot's window; the whole array if it isn't much wider.
+WINDOW = 64
+# Slabs at least of pilots that ask about something other than slabs.
+COARSE = 4
+# Times as many slabs as slices beyond which a pilot looks for nothing more.
+MOST = 8
+# Bytes that a batch of a pilot's sources takes on a CPU, to stay in its cache: half the time of a batch of all.
+CACHE = 16 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A volume, the microscope and what is recorded; images that were computed once are kept."""
+
+    volume: Volume
+    microscope: Microscope
+    acquisition: Acquisition
+    _seen: dict[Fidelity, Tensor] = field(default_factory=dict, init=False)
+
+    def __call__(self, fidelity: Fidelity) -> Tensor:
+        """Images, (prism, focus, y, x)."""
+        if fidelity not in self._seen:
+            on_cpu = self.volume.delta.device.type == "cpu"
+            batched = replace(fidelity, memory=CACHE) if on_cpu else fidelity
+            self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, batched)
+        return self._seen[fidelity]
+
+    @property
+    def slices(self) -> int:
+        """Slices of the volume."""
+        return self.volume.grid.shape[0]
+
+    def nothing(self) -> Tensor:
+        """Images of nan, for what can't be computed."""
+        _, ny, nx = self.volume.grid.shape
+        return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), ny, nx), math.nan)
+
+    def coarse(self) -> Iterator[Fidelity]:
+        """Fidelities for what has nothing to do with slabs, from the cheapest on: a strong specimen asks for a finer.
+
+        The first has slabs half as deep as the objective's field or thinner.
+        """
+        grid, n0, objective = self.volume.grid, float(self.volume.background), self.microscope.objective
+        na = n0 if objective is None else objective.na
+        deepest = n0 * self.microscope.wavelength / (2 * na**2)
+        steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
+        while steps < MOST * self.slices:
+            yield Fidelity("wave", steps=steps, order=1)
+            steps *= 2
+        yield Fidelity("wave", steps=MOST * self.slices)
+
+    def hardest(self) -> "Scene":
+        """The scene with the hardest of its images.
+
+        They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
+        """
+        prisms = self.acquisition.prisms
+        levels = [1.0 if p is None else math.sin(float(torch.as_tensor(p.bias)) / 2) ** 2 for p in prisms]
+        shears = [0.0 if p is None else float(torch.as_tensor(p.shear).norm()) for p in prisms]
+        picked = {levels.index(min(levels)), levels.index(max(levels)), shears.index(max(shears)), len(prisms) - 1}
+        depths = [float(torch.as_tensor(z)) for z in self.acquisition.focus]
+        plane = self.volume.mean_plane()
+        away = [abs(z - plane) for z in depths]
+        planes = {depths.index(min(depths)), away.index(min(away)), depths.index(max(depths))}
+        focus = [self.acquisition.focus[i] for i in sorted(planes)]
+        return replace(self, acquisition=Acquisition([prisms[i] for i in sorted(picked)], focus))
+
+    def lit(self, sources: int) -> "Scene":
+        """The scene with so many sources at most, a few of the condenser's own where it names them."""
+        condenser = self.microscope.condenser
+        if condenser is None:
+            return self
+        points, weights = condenser.sources(sources, dtype=torch.float64)
+        points, weights = points[weights > 0], weights[weights > 0]
+        if len(points) > sources:
+            some = torch.linspace(0, len(points) - 1, sources).round().long()
+            points, weights = points[some], weights[some]
+        few = Condenser(condenser.na, points, weights)
+        return replace(self, microscope=replace(self.microscope, condenser=few))
+
+    def window(self, side: int = WINDOW) -> "Scene":
+        """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.
+
+        It is faded out towards its own sides. An axis up to a quarter as long again is kept whole.
+        """
+        volume = self.volume
+        shape = volume.grid.shape
+        size = [n if n <= 1.25 * side else side for n in shape[1:]]
+        if size == list(shape[1:]):
+            return self
+        strength = volume.delta if volume.absorption is None else volume.delta.abs() + volume.absorption
+        busy = 1e-6 * strength.square()
+        for axis in (1, 2):
+            if shape[axis] > 1:
+                busy = busy + torch.gradient(strength, dim=axis)[0].square()
+        sums = F.avg_pool2d(busy.sum(0)[None, None], size, stride=1)[0, 0]
+        row, column = divmod(int(sums.argmax()), sums.shape[1])
+        rows, columns = (_fade(n, full).to(strength) for n, full in zip(size, shape[1:], strict=True))
+        delta, absorption = (
+            None if part is None else part[:, row : row + size[0], column : column + size[1]] * rows[:, None] * columns
+            for part in (volume.delta, volume.absorption)
+        )
+        assert delta is not None
+        grid = Grid((shape[0], size[0], size[1]), volume.grid.spacing)
+        return replace(self, volume=Volume(grid, delta, volume.background, absorption))
+
+
+def _fade(length: int, full: int) -> Tensor:
+    """A factor that rises from either end of a part of an axis; 1 for the whole axis."""
+    ramp = torch.ones(length)
+    if length < full:
+        width = length // 8
+        rise = torch.sin(math.pi / 2 * (torch.arange(width) + 0.5) / width).square()
+        ramp[:width], ramp[-width:] = rise, rise.flip(0)
+    return ramp
