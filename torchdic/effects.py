@@ -12,7 +12,7 @@ from torchdic.grid import Grid
 from torchdic.image_error import relative
 from torchdic.instrument import Acquisition
 from torchdic.ladders import Choice, Side
-from torchdic.pilots import MOST, Scene
+from torchdic.pilots import MOST_UNSTABLE, Scene
 from torchdic.volume import Volume
 from torchdic.wave import UnstableError
 
@@ -91,7 +91,7 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
     paraxial = against_truth(pilot(replace(coarse, defocus="paraxial")) - base)
     found.append(effect("defocus", paraxial, "paraxial in place of exact"))
     if sides[-1].padding > 0:
-        found.append(effect("sides", sides[0].error, "no padding", saved(replace(fidelity, padding=0))))
+        found.append(effect("sides", sides[0].error(K), "no padding", saved(replace(fidelity, padding=0))))
     else:
         found.append(_absent("sides"))
 
@@ -142,7 +142,7 @@ def _fewest_slabs(pilot: Scene) -> tuple[int, Tensor]:
         try:
             return steps, pilot(Fidelity("wave", steps=steps))
         except UnstableError:
-            if steps >= MOST * pilot.slices:
+            if steps >= MOST_UNSTABLE * pilot.slices:
                 raise
         steps *= 2
 

@@ -9,18 +9,19 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
-from torchdic.pilots import MOST, Scene
+from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
 from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
 MARGIN = 0.6
 # Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be.
 COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
-# Sources that see the sides: few make more fringes than many.
+# Sources that see the sides.
 AT_SIDES = 18
 # Reach of a lens's own blur in wavelengths over NA: the tail that a pupil's edge leaves falls off slowly.
 BLUR = 12.0
@@ -37,10 +38,18 @@ class Choice:
 
 @dataclass(frozen=True)
 class Side:
-    """Padding in voxels, and the error that light which comes back on the other side leaves."""
+    """Padding in voxels, and the error of light that comes back on the other side: steady, and fringes of AT_SIDES.
+
+    Fringes of many sources average out, as the root of their number.
+    """
 
     padding: int
-    error: float
+    steady: float
+    fringes: float
+
+    def error(self, sources: int) -> float:
+        """Of images that so many sources light."""
+        return math.hypot(self.steady, self.fringes * math.sqrt(AT_SIDES / max(sources, AT_SIDES)))
 
 
 def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[list[Choice], Tensor]:
@@ -88,7 +97,7 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
         try:
             return pilot(Fidelity("wave", steps=steps, order=order))
         except UnstableError:
-            if order == 2 and steps >= 4 * MOST * pilot.slices:
+            if order == 2 and steps >= MOST_UNSTABLE * pilot.slices:
                 raise
             return pilot.nothing()
 
@@ -122,21 +131,37 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
 
 def side_ladder(scene: Scene, coarse: Fidelity, tolerance: float) -> list[Side]:
     """Paddings, up to where no recorded light comes back."""
-    width = needed_padding(scene)
-    if width == 0:
-        return [Side(0, 0.0)]
-    few = scene.lit(AT_SIDES)
+    needed = needed_padding(scene)
+    if needed == 0:
+        return [Side(0, 0.0, 0.0)]
+    shape = scene.volume.grid.shape[1:]
+    quarter, half, width = (_fast(-(-needed // part), shape) for part in (4, 2, 1))
+    parts = scene.lit(AT_SIDES).halves()
+    widest = [part(replace(coarse, padding=width)) for part in parts]
+    truth = sum(widest, start=torch.zeros_like(widest[0])) / len(parts)
 
-    def seen(width: int) -> Tensor:
-        return few(replace(coarse, padding=width))
+    def lost(width: int) -> Side:
+        one, *other = (part(replace(coarse, padding=width)) - w for part, w in zip(parts, widest, strict=True))
+        if not other:
+            return Side(width, relative(one, truth), 0.0)
+        # where two halves of the sources differ, so do all from twice as many
+        error, fringes = relative((one + other[0]) / 2, truth), relative((one - other[0]) / 2, truth)
+        return Side(width, math.sqrt(max(error**2 - fringes**2, 0.0)), fringes)
 
-    widest = seen(width)
-    widths = [0, -(-width // 4), -(-width // 2)]
-    if relative(seen(0) - widest, widest) <= MARGIN / 4 * tolerance:
-        widths = [0]  # none is needed
-    errors = {w: relative(seen(w) - widest, widest) for w in widths}
-    left = errors[widths[-1]] / 3  # the blur's tail falls off slowly: so much lies beyond the widest
-    return [*(Side(w, e + left) for w, e in errors.items() if w < width), Side(width, left)]
+    narrower = [lost(0)]
+    if narrower[0].error(1) > MARGIN / 4 * tolerance:  # or none is needed
+        narrower += [lost(w) for w in sorted({quarter, half}) if w < width]
+    # the blur's tail falls off slowly: so much lies beyond the widest
+    steady, fringes = narrower[-1].steady / 3, narrower[-1].fringes / 3
+    return [*(Side(s.padding, s.steady + steady, s.fringes + fringes) for s in narrower), Side(width, steady, fringes)]
+
+
+def _fast(padding: int, shape: tuple[int, ...]) -> int:
+    """The least padding from this one on that leaves lengths of few small factors: others take up to five times."""
+    for wider in range(padding, padding + 16):
+        if all(next_fast_len(n + 2 * wider) == n + 2 * wider for n in shape):
+            return wider
+    return padding
 
 
 def needed_padding(scene: Scene) -> int:
@@ -163,5 +188,3 @@ def needed_padding(scene: Scene) -> int:
     reach = distance * sine / math.sqrt(1 - sine**2) + shear + BLUR * microscope.wavelength / (n0 * sine)
     beyond = max((reach - gap) / grid.spacing[a + 1] for a, gap in enumerate(gaps))
     return min(max(0, math.ceil(beyond / 2)), max(grid.shape[1:]) // 2)
-
-

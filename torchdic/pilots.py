@@ -14,13 +14,14 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope
 from torchdic.microscope import image
 from torchdic.volume import Volume
+from torchdic.wave import UnstableError
 
 # Voxels along each side of a pilot's window; the whole array if it isn't much wider.
 WINDOW = 64
 # Slabs at least of pilots that ask about something other than slabs.
 COARSE = 4
-# Times as many slabs as slices beyond which a pilot looks for nothing more.
-MOST = 8
+# Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
+MOST, MOST_UNSTABLE = 8, 32
 # Bytes that a batch of a pilot's sources takes on a CPU, to stay in its cache: half the time of a batch of all.
 CACHE = 16 << 20
 
@@ -33,13 +34,18 @@ class Scene:
     microscope: Microscope
     acquisition: Acquisition
     _seen: dict[Fidelity, Tensor] = field(default_factory=dict, init=False)
+    _unstable: set[Fidelity] = field(default_factory=set, init=False)
 
     def __call__(self, fidelity: Fidelity) -> Tensor:
-        """Images, (prism, focus, y, x)."""
+        """Images, (prism, focus, y, x). Raises UnstableError as `image` does."""
         if fidelity not in self._seen:
             on_cpu = self.volume.delta.device.type == "cpu"
             batched = replace(fidelity, memory=CACHE) if on_cpu else fidelity
-            self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, batched)
+            try:
+                self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, batched)
+            except UnstableError:
+                self._unstable.add(fidelity)
+                raise
         return self._seen[fidelity]
 
     @property
@@ -61,10 +67,11 @@ class Scene:
         na = n0 if objective is None else objective.na
         deepest = n0 * self.microscope.wavelength / (2 * na**2)
         steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
-        while steps < MOST * self.slices:
+        while steps < MOST_UNSTABLE * self.slices:
             yield Fidelity("wave", steps=steps, order=1)
+            yield Fidelity("wave", steps=steps)  # often carries light where the first order makes energy
             steps *= 2
-        yield Fidelity("wave", steps=MOST * self.slices)
+        yield Fidelity("wave", steps=MOST_UNSTABLE * self.slices)
 
     def hardest(self) -> "Scene":
         """The scene with the hardest of its images.
@@ -94,6 +101,34 @@ class Scene:
             points, weights = points[some], weights[some]
         few = Condenser(condenser.na, points, weights)
         return replace(self, microscope=replace(self.microscope, condenser=few))
+
+    def halves(self) -> "list[Scene]":
+        """Two scenes with every other of the condenser's own sources each; itself where it names fewer than two."""
+        condenser = self.microscope.condenser
+        if condenser is None or condenser.points is None or len(condenser.points) < 2:
+            return [self]
+        points, weights = condenser.sources(len(condenser.points))
+        return [
+            replace(
+                self,
+                microscope=replace(self.microscope, condenser=Condenser(condenser.na, points[i::2], weights[i::2])),
+            )
+            for i in (0, 1)
+        ]
+
+    @property
+    def strained(self) -> bool:
+        """Whether some slabs that were tried don't carry its light."""
+        return bool(self._unstable)
+
+    def carries(self, fidelity: Fidelity) -> bool:
+        """Whether a fidelity's slabs carry the light of all its sources."""
+        one = Acquisition(self.acquisition.prisms[:1], self.acquisition.focus[:1])
+        try:
+            replace(self, acquisition=one)(replace(fidelity, padding=0))
+        except UnstableError:
+            return False
+        return True
 
     def window(self, side: int = WINDOW) -> "Scene":
         """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.

@@ -122,7 +122,7 @@ def _plan(scene: Scene, tolerance: float) -> Plan:
     while True:
         try:
             climbed = _climb(scene, pilot, coarse, tolerance)
-            fidelity, error = _cheapest(scene, climbed, tolerance)
+            fidelity, error = _cheapest(scene, pilot, climbed, tolerance)
             worth = effects(scene, climbed, fidelity, tolerance)
             break
         except UnstableError:
@@ -149,8 +149,11 @@ def _climb(scene: Scene, pilot: Scene, coarse: Fidelity, tolerance: float) -> Cl
     return Climbed(few, coarse, truth, ways, counts, sides)
 
 
-def _cheapest(scene: Scene, climbed: Climbed, tolerance: float) -> tuple[Fidelity, float]:
-    """The cheapest choice whose error stays within its part of the tolerance, or the best, with its error."""
+def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) -> tuple[Fidelity, float]:
+    """The cheapest choice whose error stays within its part of the tolerance, or else the best, with its error.
+
+    pilot: with all of the condenser's sources, because slabs that carry the light of a few may not carry that of all.
+    """
 
     def joined() -> Iterator[tuple[Fidelity, float]]:
         for way in climbed.ways:
@@ -158,13 +161,18 @@ def _cheapest(scene: Scene, climbed: Climbed, tolerance: float) -> tuple[Fidelit
                 error = relative(way.lacks + count.lacks, climbed.truth)
                 for side in climbed.sides:
                     choice = replace(way.fidelity, sources=count.fidelity.sources, padding=side.padding)
-                    yield choice, math.hypot(error, count.beyond, side.error)
+                    yield choice, math.hypot(error, count.beyond, side.error(choice.sources))
 
+    def cost(choice: tuple[Fidelity, float]) -> float:
+        return work(choice[0], scene.volume, scene.microscope, scene.acquisition)
+
+    strained = pilot.strained or climbed.pilot.strained
     tried = list(joined())
-    meeting = [choice for choice in tried if choice[1] <= MARGIN * tolerance]
-    if not meeting:
-        return min(tried, key=lambda choice: choice[1])
-    return min(meeting, key=lambda choice: work(choice[0], scene.volume, scene.microscope, scene.acquisition))
+    meeting = sorted((choice for choice in tried if choice[1] <= MARGIN * tolerance), key=cost)
+    for choice in (*meeting, *sorted(tried, key=lambda choice: choice[1])):
+        if not strained or pilot.carries(choice[0]):
+            return choice
+    raise UnstableError(f"no number of slabs up to {climbed.ways[1].fidelity.steps} carries the light of all sources")
 
 
 def _detached(volume: Volume) -> Volume:
