@@ -32,8 +32,8 @@ from torchdic import (
     image,
     plan,
 )
-from torchdic.image_error import FLOOR, image_error
 from torchdic.cost import work
+from torchdic.image_error import FLOOR, image_error
 from torchdic.plan import describe
 from torchdic.tiff import read_volume
 

@@ -12,6 +12,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
+from torchdic.cost import SLAB
 from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
 from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
@@ -116,14 +117,20 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
 
     ways = [Choice(Fidelity("projection"), pilot(Fidelity("projection")) - truth)]
     orders: tuple[Literal[1, 2], ...] = 2, 1
+    dearest = math.inf  # beyond this work the second order serves better
     for order in orders:
         steps = ladder[-1]
+        while SLAB[order] * steps >= dearest:
+            steps = -(-steps // 2)
         while steps >= 1:
             lacks = crossed(steps, order) - truth
             if not bool(torch.isfinite(lacks).all()):
                 break
             ways.append(Choice(Fidelity("wave", steps=steps, order=order), lacks))
-            if steps == 1 or relative(lacks, truth) > 4 * tolerance:
+            error = relative(lacks, truth)
+            if order == 2 and error <= MARGIN / 8 * tolerance:
+                dearest = SLAB[2] * steps
+            if steps == 1 or error > 4 * tolerance:
                 break
             steps = -(-steps // 2)
     return ways, truth
