@@ -61,10 +61,6 @@ CONTRACT = {
     "Volume",
     "image",
     "image_field",
-    "pilots",
-    "cost",
-    "ladders",
-    "effects",
     "plan",
     "trace",
 }

@@ -23,7 +23,7 @@ MARGIN = 0.6
 # Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be.
 COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
 # Sources that see the sides.
-AT_SIDES = 18
+AT_SIDES = 8
 # Reach of a lens's own blur in wavelengths over NA: the tail that a pupil's edge leaves falls off slowly.
 BLUR = 12.0
 

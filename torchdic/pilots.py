@@ -1,7 +1,7 @@
 """A scene, and the smaller ones that stand for it: its busiest window, its hardest images, few of its sources."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -133,7 +133,8 @@ class Scene:
     def window(self, side: int = WINDOW) -> "Scene":
         """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.
 
-        It is faded out towards its own sides. An axis up to a quarter as long again is kept whole.
+        Towards its own sides it fades into the mean along them, so that layers get no edges. An axis up to a quarter as
+        long again is kept whole.
         """
         volume = self.volume
         shape = volume.grid.shape
@@ -147,21 +148,27 @@ class Scene:
                 busy = busy + torch.gradient(strength, dim=axis)[0].square()
         sums = F.avg_pool2d(busy.sum(0)[None, None], size, stride=1)[0, 0]
         row, column = divmod(int(sums.argmax()), sums.shape[1])
-        rows, columns = (_fade(n, full).to(strength) for n, full in zip(size, shape[1:], strict=True))
-        delta, absorption = (
-            None if part is None else part[:, row : row + size[0], column : column + size[1]] * rows[:, None] * columns
-            for part in (volume.delta, volume.absorption)
-        )
+        fade = _fade(size, shape[1:]).to(strength)
+
+        def cut(part: Tensor) -> Tensor:
+            inside = part[:, row : row + size[0], column : column + size[1]]
+            rim = torch.cat((inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)), 1).mean(1)[:, None, None]
+            return rim + (inside - rim) * fade
+
+        delta, absorption = (None if part is None else cut(part) for part in (volume.delta, volume.absorption))
         assert delta is not None
         grid = Grid((shape[0], size[0], size[1]), volume.grid.spacing)
         return replace(self, volume=Volume(grid, delta, volume.background, absorption))
 
 
-def _fade(length: int, full: int) -> Tensor:
-    """A factor that rises from either end of a part of an axis; 1 for the whole axis."""
-    ramp = torch.ones(length)
-    if length < full:
-        width = length // 8
-        rise = torch.sin(math.pi / 2 * (torch.arange(width) + 0.5) / width).square()
-        ramp[:width], ramp[-width:] = rise, rise.flip(0)
-    return ramp
+def _fade(size: Sequence[int], full: Sequence[int]) -> Tensor:
+    """A factor (y, x) that rises from the sides of a part of an array; 1 along whole axes."""
+    ramps = []
+    for length, whole in zip(size, full, strict=True):
+        ramp = torch.ones(length)
+        if length < whole:
+            width = length // 8
+            rise = torch.sin(math.pi / 2 * (torch.arange(width) + 0.5) / width).square()
+            ramp[:width], ramp[-width:] = rise, rise.flip(0)
+        ramps.append(ramp)
+    return ramps[0][:, None] * ramps[1]
