@@ -14,7 +14,7 @@ from torchdic.microscope import image
 from torchdic.volume import Volume
 
 # Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels.
-SETUP, IMAGE, ABSORBING = 30.0, 4.5, 27.0
+SETUP, IMAGE, ABSORBING = 30.0, 4.5, 8.0
 SLAB = {1: 3.5, 2: 5.0}
 SLICE = {"linear": 5.0, "cubic": 90.0}
 BENT_SLICE = 260.0

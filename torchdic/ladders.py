@@ -142,7 +142,7 @@ def side_ladder(scene: Scene, coarse: Fidelity, tolerance: float) -> list[Side]:
     if needed == 0:
         return [Side(0, 0.0, 0.0)]
     shape = scene.volume.grid.shape[1:]
-    quarter, half, width = (_fast(-(-needed // part), shape) for part in (4, 2, 1))
+    half, width = (_fast(-(-needed // part), shape) for part in (2, 1))
     parts = scene.lit(AT_SIDES).halves()
     widest = [part(replace(coarse, padding=width)) for part in parts]
     truth = sum(widest, start=torch.zeros_like(widest[0])) / len(parts)
@@ -156,8 +156,8 @@ def side_ladder(scene: Scene, coarse: Fidelity, tolerance: float) -> list[Side]:
         return Side(width, math.sqrt(max(error**2 - fringes**2, 0.0)), fringes)
 
     narrower = [lost(0)]
-    if narrower[0].error(1) > MARGIN / 4 * tolerance:  # or none is needed
-        narrower += [lost(w) for w in sorted({quarter, half}) if w < width]
+    if narrower[0].error(1) > MARGIN / 4 * tolerance and half < width:  # or none is needed
+        narrower.append(lost(half))
     # the blur's tail falls off slowly: so much lies beyond the widest
     steady, fringes = narrower[-1].steady / 3, narrower[-1].fringes / 3
     return [*(Side(s.padding, s.steady + steady, s.fringes + fringes) for s in narrower), Side(width, steady, fringes)]
