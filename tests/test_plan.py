@@ -30,11 +30,16 @@ from torchdic import (
     ToleranceWarning,
     Volume,
     image,
+    pilots,
     plan,
 )
+from torchdic.cost import directions, work
 from torchdic.image_error import FLOOR, image_error
-from torchdic.plan import describe, work
+from torchdic.ladders import way_ladder
+from torchdic.plan import describe
 from torchdic.tiff import read_volume
+from torchdic.wave import UnstableError
+from torchdic.wrap_around import WrapAroundWarning
 
 GRID = Grid((16, 48, 48), (0.4, 0.2, 0.2))
 MICROSCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))
@@ -355,6 +360,93 @@ def test_specimens_that_stay_clear_of_the_sides_are_padded_where_light_comes_rou
     assert plan(gaussian(0.02, 0.6, grid), microscope, far, 0.02).fidelity.padding > 0
 
 
+# strong specimens
+
+
+def strong(contrast, microscope=MICROSCOPE):
+    """A bead whose index jumps by so much that slabs which take part of it in make energy."""
+    grid = Grid((12, 32, 32), (0.4, 0.2, 0.2))
+    return Scene(volume(Bead(1.2, contrast, 1.36).delta(grid), grid), 0.2, microscope, padding=16)
+
+
+def test_a_specimen_too_strong_for_thick_slabs_is_planned_with_finer_ones():
+    scene = strong(0.3)
+    for coarse in (Fidelity(steps=8, order=1), Fidelity(order=1), Fidelity(steps=24, order=1)):
+        with pytest.raises(UnstableError):
+            scene.image(coarse)
+    found = outcome(scene)
+    assert found.made.met
+    assert found.error <= scene.tolerance
+    assert found.predicted_within(3), found
+    assert by_name(found.made)["steps"].needed
+
+
+def test_the_converged_wave_is_finite_where_only_thin_slabs_carry_the_light():
+    """One slab a slice makes energy, and so do eight; the ladder goes on to the first two that don't."""
+    scene = strong(0.5, replace(MICROSCOPE, condenser=None))
+    for steps in (12, 96):
+        with pytest.raises(UnstableError):
+            scene.image(Fidelity(steps=steps))
+    ways, truth = way_ladder(pilots.Scene(scene.volume, scene.microscope, scene.acquisition), scene.tolerance)
+    assert bool(torch.isfinite(truth).all())
+    assert all(bool(torch.isfinite(way.lacks).all()) for way in ways)
+    assert {way.fidelity.steps for way in ways if way.fidelity.order == 2} >= {192, 384}
+
+
+def test_slabs_that_carry_a_few_sources_but_not_all_are_not_chosen():
+    """Of the pilot's sources none makes energy in 24 slabs, of 50 two do."""
+    scene = strong(0.3)
+    few = pilots.Scene(scene.volume, scene.microscope, scene.acquisition).lit(18)
+    few(Fidelity(steps=24))
+    with pytest.raises(UnstableError):
+        scene.image(Fidelity(steps=24, sources=50))
+    scene.image(scene.plan().fidelity)
+
+
+def test_a_specimen_that_no_slabs_carry_is_said_to_be_one():
+    grid = Grid((6, 24, 24), (0.4, 0.2, 0.2))
+    with pytest.raises(ValueError, match=r"can't go on toward \+z"):
+        plan(volume(-62 * GaussianBall(0.6, 0.018, 1.36).delta(grid), grid), MICROSCOPE, ACQUISITION, 0.2)
+
+
+def test_pilots_keep_their_warnings_to_themselves():
+    """A window may be too narrow for a focus that the whole array has room for."""
+    grid = Grid((4, 128, 128), (0.4, 0.2, 0.2))
+    scene = Scene(gaussian(0.3, 0.3, grid), 0.1, Microscope(0.546, Objective(0.75)), Acquisition([SHEARED], [16.0]))
+    pilot = pilots.Scene(scene.volume, scene.microscope, scene.acquisition).window()
+    with pytest.warns(WrapAroundWarning):
+        pilot(Fidelity())
+    scene.image(scene.plan().fidelity)
+
+
+# what an image costs
+
+
+@pytest.mark.parametrize(
+    "condenser",
+    [
+        None,
+        Condenser(0.0),
+        Condenser(0.4),
+        Condenser(0.5, inner_na=0.4),
+        Condenser(0.3, torch.tensor([[0.0, 0.0], [0.2, 0.1], [-0.2, -0.1]])),
+    ],
+    ids=["none", "axial", "disc", "ring", "points"],
+)
+@pytest.mark.parametrize("sources", [2, 18, 40, 41])
+def test_directions_are_counted_as_the_microscope_makes_them(condenser, sources):
+    microscope = replace(MICROSCOPE, condenser=condenser)
+    made, _ = microscope.sources(Fidelity(sources=sources), dtype=torch.float32, device=torch.device("cpu"))
+    assert directions(microscope, sources) == len(made)
+
+
+def test_sources_in_batches_that_stay_in_cache_give_the_same_images():
+    scene = cell()
+    fidelity = Fidelity(sources=72, order=1)
+    pilot = pilots.Scene(scene.volume, scene.microscope, scene.acquisition)
+    assert image_error(pilot(fidelity), scene.image(fidelity)) < 1e-5
+
+
 # its manners
 
 
@@ -380,6 +472,19 @@ def test_what_cannot_be_met_is_warned_of_with_what_to_ask_for():
 def test_a_tolerance_is_above_0_and_finite(tolerance):
     with pytest.raises(ValueError, match=r"tolerance .* must be above 0, and finite"):
         plan(coherent().volume, MICROSCOPE, ACQUISITION, tolerance)
+
+
+def test_a_window_of_layers_has_no_edges_of_its_own():
+    """Layers wider than a pilot's window scatter nothing, so that one source and one slab do."""
+    grid = Grid((8, 96, 90), (0.4, 0.2, 0.2))
+    delta = (0.02 * torch.sin(grid.coordinates(0)))[:, None, None].expand(grid.shape)
+    scene = Scene(volume(delta, grid), 0.03, padding=0)
+    window = pilots.Scene(scene.volume, scene.microscope, scene.acquisition).window().volume
+    assert window.grid.shape[1:] == (64, 64)
+    assert torch.allclose(window.delta, scene.volume.delta[:, :64, :64], rtol=1e-6)
+    made = scene.plan()
+    assert (made.fidelity.sources, made.fidelity.steps) == (1, 1)
+    assert image_error(scene.image(made.fidelity), scene.truth(made)) < scene.tolerance
 
 
 def test_a_large_volume_is_judged_by_its_busiest_window():

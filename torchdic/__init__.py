@@ -11,6 +11,7 @@ beams. Intensity is relative to the empty bright field, so an empty DIC image eq
 
 from torchdic.camera import Camera
 from torchdic.condenser import Condenser, Spectrum
+from torchdic.effects import Effect
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
 from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope, SamplingWarning
@@ -18,7 +19,7 @@ from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
-from torchdic.plan import Effect, Plan, ToleranceWarning, plan
+from torchdic.plan import Plan, ToleranceWarning, plan
 from torchdic.precision import Candidate, Trial, work_precision
 from torchdic.prism import Prism
 from torchdic.rays import Rays, launch, trace

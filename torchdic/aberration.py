@@ -256,7 +256,7 @@ def _cross(
 
         return equal_steps(slope, state, depths[first : last + 1], fidelity.solver)
 
-    ray = torch.broadcast_shapes(position.shape[1:], momentum.shape[1:])
+    ray = torch.broadcast_tensors(position, momentum)[0].shape[1:]
     state = position.new_zeros(13 if pair else 5, *ray)
     if pair:
         state[[9, 12]] = 1.0

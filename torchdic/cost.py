@@ -1,0 +1,83 @@
+"""What an image costs: its work, by counting, and its seconds, by timing a small part of it."""
+
+import math
+import time
+from dataclasses import replace
+from functools import cache
+
+import torch
+
+from torchdic.condenser import Condenser, disc_quadrature
+from torchdic.fidelity import Fidelity
+from torchdic.instrument import Acquisition, Microscope
+from torchdic.microscope import image
+from torchdic.volume import Volume
+
+# Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels.
+SETUP, IMAGE, ABSORBING = 30.0, 4.5, 8.0
+SLAB = {1: 3.5, 2: 5.0}
+SLICE = {"linear": 5.0, "cubic": 90.0}
+BENT_SLICE = 260.0
+# Work of the part that is timed: some 10 ms, beyond what calls alone take.
+TIMED = 3e7
+
+
+def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition: Acquisition) -> float:
+    """What an image costs, in FFT butterflies: sources × (what crosses the specimen + images) × N log2 N."""
+    slices, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
+    pixels = ny * nx
+    if fidelity.propagation == "wave":
+        extra = 0.0 if volume.absorption is None else ABSORBING
+        inside = (fidelity.steps or slices) * (SLAB[fidelity.order] + extra)
+    elif fidelity.propagation == "projection":
+        inside = slices * SLICE[fidelity.interpolation] * (1 if volume.absorption is None else 2)
+    else:
+        inside = (fidelity.steps or slices) * BENT_SLICE
+    polarisation = microscope.polarisation
+    fields = 1
+    if microscope.vectorial:
+        assert polarisation is not None
+        fields = polarisation.states
+    elif polarisation is not None and not polarisation.ideal:
+        fields = 2
+    images = fields * len(acquisition.prisms) * len(acquisition.focus)
+    sources = len(microscope.colours()) * directions(microscope, fidelity.sources)
+    return sources * (SETUP + inside + IMAGE * images) * pixels * math.log2(max(pixels, 2))
+
+
+def directions(microscope: Microscope, sources: int) -> int:
+    """How many directions the light comes from if at most so many are asked for."""
+    condenser = microscope.condenser
+    if condenser is None or condenser.na == 0:
+        return 1 if condenser is None or condenser.points is None else len(condenser.points)
+    if condenser.points is not None:
+        return len(condenser.points)
+    return _in_disc(sources, 0.0 if condenser.inner_na is None else condenser.inner_na / condenser.na)
+
+
+@cache
+def _in_disc(count: int, hole: float) -> int:
+    return len(disc_quadrature(count, hole)[1])
+
+
+@torch.no_grad()
+def seconds(volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity) -> float:
+    """Seconds of an image without gradients: those of a few sources, slabs and one focus, scaled by the work.
+
+    They cross an empty volume: few slabs need not carry the light of a strong specimen.
+    """
+    absorption = None if volume.absorption is None else torch.zeros_like(volume.delta)
+    empty = Volume(volume.grid, torch.zeros_like(volume.delta), volume.background.detach(), absorption)
+    short = replace(fidelity, steps=min(fidelity.steps or volume.grid.shape[0], 8))
+    brief = Acquisition(acquisition.prisms, acquisition.focus[:1])
+    condenser = microscope.condenser or Condenser(0.0)
+    points, _ = condenser.sources(fidelity.sources, dtype=torch.float64)
+    each = work(short, volume, microscope, brief) / (len(points) * len(microscope.colours()))
+    some = max(1, int(TIMED / each))
+    few = replace(microscope, condenser=Condenser(condenser.na, points[-some:]), spectrum=None)
+    best = math.inf
+    for _ in range(2):
+        started = time.perf_counter()
+        image(empty, few, brief, short)
+        best = min(best, time.perf_counter() - started)
+    return best * work(fidelity, volume, microscope, acquisition) / work(short, empty, few, brief)

@@ -1,0 +1,174 @@
+"""A scene, and the smaller ones that stand for it: its busiest window, its hardest images, few of its sources."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdic.condenser import Condenser
+from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
+from torchdic.instrument import Acquisition, Microscope
+from torchdic.microscope import image
+from torchdic.volume import Volume
+from torchdic.wave import UnstableError
+
+# Voxels along each side of a pilot's window; the whole array if it isn't much wider.
+WINDOW = 64
+# Slabs at least of pilots that ask about something other than slabs.
+COARSE = 4
+# Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
+MOST, MOST_UNSTABLE = 8, 32
+# Bytes that a batch of a pilot's sources takes on a CPU, to stay in its cache: half the time of a batch of all.
+CACHE = 16 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A volume, the microscope and what is recorded; images that were computed once are kept."""
+
+    volume: Volume
+    microscope: Microscope
+    acquisition: Acquisition
+    _seen: dict[Fidelity, Tensor] = field(default_factory=dict, init=False)
+    _unstable: set[Fidelity] = field(default_factory=set, init=False)
+
+    def __call__(self, fidelity: Fidelity) -> Tensor:
+        """Images, (prism, focus, y, x). Raises UnstableError as `image` does."""
+        if fidelity not in self._seen:
+            on_cpu = self.volume.delta.device.type == "cpu"
+            batched = replace(fidelity, memory=CACHE) if on_cpu else fidelity
+            try:
+                self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, batched)
+            except UnstableError:
+                self._unstable.add(fidelity)
+                raise
+        return self._seen[fidelity]
+
+    @property
+    def slices(self) -> int:
+        """Slices of the volume."""
+        return self.volume.grid.shape[0]
+
+    def nothing(self) -> Tensor:
+        """Images of nan, for what can't be computed."""
+        _, ny, nx = self.volume.grid.shape
+        return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), ny, nx), math.nan)
+
+    def coarse(self) -> Iterator[Fidelity]:
+        """Fidelities for what has nothing to do with slabs, from the cheapest on: a strong specimen asks for a finer.
+
+        The first has slabs half as deep as the objective's field or thinner.
+        """
+        grid, n0, objective = self.volume.grid, float(self.volume.background), self.microscope.objective
+        na = n0 if objective is None else objective.na
+        deepest = n0 * self.microscope.wavelength / (2 * na**2)
+        steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
+        while steps < MOST_UNSTABLE * self.slices:
+            yield Fidelity("wave", steps=steps, order=1)
+            yield Fidelity("wave", steps=steps)  # often carries light where the first order makes energy
+            steps *= 2
+        yield Fidelity("wave", steps=MOST_UNSTABLE * self.slices)
+
+    def hardest(self) -> "Scene":
+        """The scene with the hardest of its images.
+
+        They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
+        """
+        prisms = self.acquisition.prisms
+        levels = [1.0 if p is None else math.sin(float(torch.as_tensor(p.bias)) / 2) ** 2 for p in prisms]
+        shears = [0.0 if p is None else float(torch.as_tensor(p.shear).norm()) for p in prisms]
+        picked = {levels.index(min(levels)), levels.index(max(levels)), shears.index(max(shears)), len(prisms) - 1}
+        depths = [float(torch.as_tensor(z)) for z in self.acquisition.focus]
+        plane = self.volume.mean_plane()
+        away = [abs(z - plane) for z in depths]
+        planes = {depths.index(min(depths)), away.index(min(away)), depths.index(max(depths))}
+        focus = [self.acquisition.focus[i] for i in sorted(planes)]
+        return replace(self, acquisition=Acquisition([prisms[i] for i in sorted(picked)], focus))
+
+    def lit(self, sources: int) -> "Scene":
+        """The scene with so many sources at most, a few of the condenser's own where it names them."""
+        condenser = self.microscope.condenser
+        if condenser is None:
+            return self
+        points, weights = condenser.sources(sources, dtype=torch.float64)
+        points, weights = points[weights > 0], weights[weights > 0]
+        if len(points) > sources:
+            some = torch.linspace(0, len(points) - 1, sources).round().long()
+            points, weights = points[some], weights[some]
+        few = Condenser(condenser.na, points, weights)
+        return replace(self, microscope=replace(self.microscope, condenser=few))
+
+    def halves(self) -> "list[Scene]":
+        """Two scenes with every other of the condenser's own sources each; itself where it names fewer than two."""
+        condenser = self.microscope.condenser
+        if condenser is None or condenser.points is None or len(condenser.points) < 2:
+            return [self]
+        points, weights = condenser.sources(len(condenser.points))
+        return [
+            replace(
+                self,
+                microscope=replace(self.microscope, condenser=Condenser(condenser.na, points[i::2], weights[i::2])),
+            )
+            for i in (0, 1)
+        ]
+
+    @property
+    def strained(self) -> bool:
+        """Whether some slabs that were tried don't carry its light."""
+        return bool(self._unstable)
+
+    def carries(self, fidelity: Fidelity) -> bool:
+        """Whether a fidelity's slabs carry the light of all its sources."""
+        one = Acquisition(self.acquisition.prisms[:1], self.acquisition.focus[:1])
+        try:
+            replace(self, acquisition=one)(replace(fidelity, padding=0))
+        except UnstableError:
+            return False
+        return True
+
+    def window(self, side: int = WINDOW) -> "Scene":
+        """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.
+
+        Towards its own sides it fades into the mean along them, so that layers get no edges. An axis up to a quarter as
+        long again is kept whole.
+        """
+        volume = self.volume
+        shape = volume.grid.shape
+        size = [n if n <= 1.25 * side else side for n in shape[1:]]
+        if size == list(shape[1:]):
+            return self
+        strength = volume.delta if volume.absorption is None else volume.delta.abs() + volume.absorption
+        busy = 1e-6 * strength.square()
+        for axis in (1, 2):
+            if shape[axis] > 1:
+                busy = busy + torch.gradient(strength, dim=axis)[0].square()
+        sums = F.avg_pool2d(busy.sum(0)[None, None], size, stride=1)[0, 0]
+        row, column = divmod(int(sums.argmax()), sums.shape[1])
+        fade = _fade(size, shape[1:]).to(strength)
+
+        def cut(part: Tensor) -> Tensor:
+            inside = part[:, row : row + size[0], column : column + size[1]]
+            rim = torch.cat((inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)), 1).mean(1)[:, None, None]
+            return rim + (inside - rim) * fade
+
+        delta, absorption = (None if part is None else cut(part) for part in (volume.delta, volume.absorption))
+        assert delta is not None
+        grid = Grid((shape[0], size[0], size[1]), volume.grid.spacing)
+        return replace(self, volume=Volume(grid, delta, volume.background, absorption))
+
+
+def _fade(size: Sequence[int], full: Sequence[int]) -> Tensor:
+    """A factor (y, x) that rises from the sides of a part of an array; 1 along whole axes."""
+    ramps = []
+    for length, whole in zip(size, full, strict=True):
+        ramp = torch.ones(length)
+        if length < whole:
+            width = length // 8
+            rise = torch.sin(math.pi / 2 * (torch.arange(width) + 0.5) / width).square()
+            ramp[:width], ramp[-width:] = rise, rise.flip(0)
+        ramps.append(ramp)
+    return ramps[0][:, None] * ramps[1]
