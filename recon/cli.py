@@ -48,6 +48,7 @@ from torchdic import (
     Objective,
     Prism,
     SamplingWarning,
+    ShortOfMemoryError,
     ToleranceWarning,
     Volume,
     image,
@@ -87,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
-    except (UnstableError, SidewaysError) as error:
+    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)

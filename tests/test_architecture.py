@@ -36,6 +36,7 @@ LAYERS = (
     "instrument",
     "wrap_around",
     "imaging",
+    "memory",
     "microscope",
     "weak",
     "image_error",

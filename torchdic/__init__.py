@@ -16,6 +16,7 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope, SamplingWarning
 from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
+from torchdic.memory import Foreseen, ShortOfMemoryError, foreseen
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.plan import Effect, Plan, ToleranceWarning, plan
@@ -34,6 +35,7 @@ __all__ = [
     "Condenser",
     "Effect",
     "Fidelity",
+    "Foreseen",
     "Grid",
     "JonesPupil",
     "Layer",
@@ -44,11 +46,13 @@ __all__ = [
     "Prism",
     "Rays",
     "SamplingWarning",
+    "ShortOfMemoryError",
     "Spectrum",
     "ThinLens",
     "ToleranceWarning",
     "Trial",
     "Volume",
+    "foreseen",
     "image",
     "image_field",
     "launch",

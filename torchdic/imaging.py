@@ -12,6 +12,7 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope
 from torchdic.jones import unpolarised
 from torchdic.jones_pupil import product, turn
+from torchdic.recompute import Demand
 from torchdic.wave import axial_difference, exp_i, paraxial_difference, to_field
 from torchdic.wrap_around import check_wrap_around
 
@@ -137,17 +138,37 @@ def _state_transfers(
     return transfers
 
 
-def kept_by_imaging(microscope: Microscope, acquisition: Acquisition, components: int = 1) -> int:
-    """Values per source and pixel that autograd keeps for the backward pass; components: of the spectrum."""
+def demand_of_imaging(
+    microscope: Microscope, acquisition: Acquisition, components: int = 1, *, learned: bool = False
+) -> Demand:
+    """What `form_image` holds; measured by `python benchmarks/memory.py`.
+
+    components: of the spectrum. learned: whether the microscope or acquisition is, and not the specimen alone.
+    """
+    focus, prisms, polarisation = len(acquisition.focus), acquisition.prisms, microscope.polarisation
+    objective = microscope.objective
+    lens = (
+        0 if objective is None else 2 * (bool(objective.aberrations) or bool(objective.layer or objective.apodisation))
+    )
     if microscope.vectorial:
-        assert microscope.polarisation is not None
-        states = sum(4 if prism is None else microscope.polarisation.states for prism in acquisition.prisms)
-        per_focus = 4 * components + 2 * states
-        return (
-            KEPT_BY_MATRIX
-            + (4 * states + 10 * len(acquisition.prisms)) * components
-            + per_focus * len(acquisition.focus)
+        assert polarisation is not None
+        assert polarisation.pupil is not None
+        pupil = polarisation.pupil
+        states = [4 if prism is None else polarisation.states for prism in prisms]
+        turned = pupil.depolarisation and components == 1
+        factors = bool(pupil.retardance) + bool(pupil.diattenuation) + turned
+        matrix = KEPT_BY_MATRIX + 2 * focus if learned else 0
+        alone = (31 if factors < 2 else 46) + 2 * components * sum(states) + 4 * (max(states) - 1)
+        return Demand(
+            alone, 2 * focus + 2 * (components + focus) * sum(states) + lens + matrix, 7 * max(states) + 25 * learned
         )
-    fields = 1 if microscope.polarisation is None or microscope.polarisation.ideal else 2
-    per_source = 0 if microscope.condenser_prism else 2 * fields * len(acquisition.prisms)
-    return len(acquisition.focus) * (2 + 2 * fields * len(acquisition.prisms)) + per_source
+    fields = 1 if polarisation is None or polarisation.ideal else 2
+    # a transfer for each source, or one for all of them
+    own = 0 if microscope.condenser_prism else fields * len(prisms)
+    extra = 7 if fields == 2 else 0
+    alone = 12 + lens + (2 if focus * len(prisms) > 1 else 0) + (1 + 2 * own if own else 0) + extra
+    kept = focus * (2 + 2 * fields * len(prisms)) + (2 * len(prisms) if fields == 2 else 0) + own + lens
+    if learned:
+        terms = 0 if objective is None else len(objective.aberrations or {})
+        kept += 3 + 2 * len(prisms) + terms
+    return Demand(alone, kept, 10 if fields == 1 else 13)
