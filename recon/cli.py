@@ -57,6 +57,7 @@ from torchdic import (
 from torchdic.fidelity import Propagation
 from torchdic.files import written_whole
 from torchdic.landing import SidewaysError
+from torchdic.memory import allotted
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
@@ -138,13 +139,16 @@ def _simulate(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
     if config.simulation.exact and not hasattr(specimen, "field"):
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
-    prepare_folder(options.out)
     if config.simulation.exact:
+        prepare_folder(options.out)
         images = exact_images(specimen, grid, microscope, acquisition, fidelity)
     else:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
             volume = Volume(grid, delta, specimen.background)
+            if config.tolerance is None:  # else a fidelity has yet to be planned
+                allotted(volume, microscope, acquisition, fidelity)
+            prepare_folder(options.out)
             if config.tolerance is not None:
                 planned = plan(volume, microscope, acquisition, config.tolerance)
                 print(announce(planned), flush=True)

@@ -158,7 +158,8 @@ def demand_of_imaging(
         turned = pupil.depolarisation and components == 1
         factors = bool(pupil.retardance) + bool(pupil.diattenuation) + turned
         matrix = KEPT_BY_MATRIX + 2 * focus if learned else 0
-        alone = (31 if factors < 2 else 46) + 2 * components * sum(states) + 4 * (max(states) - 1)
+        beams = max((polarisation.states for prism in prisms if prism is not None), default=0)
+        alone = max(46 if factors > 1 else 31, 29 + 2 * components * sum(states) + 6 * beams)
         return Demand(
             alone, 2 * focus + 2 * (components + focus) * sum(states) + lens + matrix, 7 * max(states) + 25 * learned
         )

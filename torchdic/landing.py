@@ -126,7 +126,7 @@ def demand_of_rays(volume: Volume, fidelity: Fidelity, *, turned: bool = False) 
     forth = 120 + 25 * index if cubic else 80
     # where rays go straight on, each corner of the two triangles beside a pixel falls on a pixel: 8 pairs instead of 2
     empty = 1 - float((volume.delta.detach() != 0).any(0).sum()) / area
-    once = 25 + 12 * index + (10 + 15 * index) * (2 + 6 * empty)
+    once = 10 + 12 * index + (10 + 15 * index) * (2 + 6 * empty)
     kept = 77 + 12.5 * index + 11 * absorbs + 18 * turned - 20 * (not fidelity.amplitude)
     return Demand(
         rays * max(forth, 81 + 14 * absorbs + 13 * turned),
@@ -136,6 +136,7 @@ def demand_of_rays(volume: Volume, fidelity: Fidelity, *, turned: bool = False) 
         rays * step,
         rays * back,
         rays * 2 * (5 + absorbs + turned),
+        captured=rays * 7,
         once=rays * once,
     )
 

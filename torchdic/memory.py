@@ -261,6 +261,7 @@ class _Scene:
             + slabs * (1 - longest / steps) * self.slices,
         )
         if several:
+            found += self.colours * self.sources * crossing.captured
             return self.aside + max(found + self.slices, 3 * self.slices, self.before)
         return self.aside + max(found + others, 2 * self.slices, self.before)
 
@@ -324,8 +325,7 @@ def _scene(
             before = lens.kept + lens.step * max(last - first for first, last in ranges)
     imaging = demand_of_imaging(microscope, acquisition, components, learned=wanted and setting)
     images, colours = len(acquisition.prisms) * len(acquisition.focus), len(microscope.colours())
-    if colours > 1:
-        aside += colours * images
+    aside += (colours - 1) * images * math.prod(volume.grid.shape[1:]) / pixels
     return _Scene(
         crossing,
         imaging,

@@ -20,7 +20,8 @@ class Demand:
     alone: at most, where no gradient is wanted. kept: for the backward pass, and each of `steps` steps keeps `step`
     more. working: at most beside all that is kept. back: at most beside the steps' part alone, while the backward pass
     takes them back. carried: from slab to slab of steps that are computed again. shared: kept by each step, however
-    many sources there are. once: at most beside all that is kept, or `alone`, by one source after the other.
+    many sources there are. captured: kept even of batches that are computed again. once: at most beside the steps'
+    part, or alone, by one source after the other.
     """
 
     alone: float
@@ -31,6 +32,7 @@ class Demand:
     back: float = 0
     carried: float = 0
     shared: float = 0
+    captured: float = 0
     once: float = 0
 
     @property

@@ -204,6 +204,7 @@ def demand_of_wave(volume: Volume, momentum: Tensor, fidelity: Fidelity) -> Dema
         working,
         carried=2,
         shared=3 + 3 * absorbs,
+        captured=3,
     )
 
 
