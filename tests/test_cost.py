@@ -147,7 +147,8 @@ def test_bending_and_amplitude_are_paid_by_those_who_ask_for_them(delta):
     assert straight < bent / 3
     assert bent < whole
     bent, whole = (peak(taking(delta, propagation="rays", amplitude=amplitude)) for amplitude in (False, True))
-    assert bent < whole
+    # without gradients the most is held before the amplitude is made
+    assert bent <= whole
 
 
 def test_absorption_is_sampled_only_where_there_is_some(delta, counted, propagation):
