@@ -47,6 +47,7 @@ from torchdic import (
     Objective,
     Prism,
     SamplingWarning,
+    ShortOfMemoryError,
     ToleranceWarning,
     Volume,
     image,
@@ -55,6 +56,7 @@ from torchdic import (
 from torchdic.fidelity import Propagation
 from torchdic.files import write_json, write_text
 from torchdic.landing import SidewaysError
+from torchdic.memory import allotted
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
@@ -86,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
-    except (UnstableError, SidewaysError) as error:
+    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
         return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
@@ -136,13 +138,16 @@ def _simulate(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
     if config.simulation.exact and not hasattr(specimen, "field"):
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
-    prepare_folder(options.out)
     if config.simulation.exact:
+        prepare_folder(options.out)
         images = exact_images(specimen, grid, microscope, acquisition, fidelity)
     else:
         with torch.no_grad():
             delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
             volume = Volume(grid, delta, specimen.background)
+            if config.tolerance is None:  # else a fidelity has yet to be planned
+                allotted(volume, microscope, acquisition, fidelity)
+            prepare_folder(options.out)
             if config.tolerance is not None:
                 planned = plan(volume, microscope, acquisition, config.tolerance)
                 print(announce(planned), flush=True)

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,15 +19,19 @@ from recon import checkpoint, figures
 from recon.checkpoint import Checkpoint, CheckpointError, Row
 from recon.config import Config, ConfigError, SimulationSection, dump, flat
 from recon.descend import Step, descend
+from recon.initial import bytes_of_linear_start
 from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
 from recon.misfit import gaussian, spatial_variance
 from recon.planned import announce_record, current
-from torchdic import Fidelity, Volume, image
+from torchdic import Fidelity, Volume, image, memory
 from torchdic.files import write_json, write_text, written_whole
 from torchdic.tiff import StackError, read_stack, write_volume
 
 CHECKPOINT = "checkpoint.pt"
+# Volumes that a descent holds beside an image and its gradient: Δn and what it is made of, Adam's moments, the total
+# variation's differences, and the last two steps that are handed out. 12 to 15 as measured.
+COPIES = 15
 # Without a [fidelity] section: what a first-order split step lacks is below what condenser directions and voxels leave.
 RECOMMENDED = Fidelity("wave", order=1)
 
@@ -89,14 +94,16 @@ def reconstruct(
     """Fit a volume to the configuration's stack and leave it in `out`, with metrics, log, configuration and figures.
 
     resume: go on from the checkpoint in `out`, if there is one. restart: begin anew in spite of one.
-    Raises ConfigError, StackError and CheckpointError for bad input, before `out` is touched; InterruptedRunError on
-    Ctrl-C, with a checkpoint saved.
+    Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
+    the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint saved.
     """
     fidelity = config.tolerance or config.fidelity or RECOMMENDED
     if isinstance(fidelity, Fidelity):
         config = replace(config, fidelity=fidelity)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
+    if isinstance(fidelity, Fidelity):
+        _check_room(config, fidelity, data)
     identity = _identity(config, measured)
     saved = out / CHECKPOINT
     start: Checkpoint | None = None
@@ -136,6 +143,18 @@ def reconstruct(
     figures.save(figures.draw_misfit(rows), out / "misfit.png")
     saved.unlink(missing_ok=True)
     return Result(delta, metrics)
+
+
+def _check_room(config: Config, fidelity: Fidelity, data: Tensor) -> None:
+    """Raise ShortOfMemoryError where a descent would take more memory than is free."""
+    grid, recipe = config.volume.grid, config.reconstruction
+    volume = Volume(grid, data.new_zeros(grid.shape), config.volume.background)
+    wanted = memory.foreseen(volume, config.microscope, config.acquisition, fidelity, gradient=True).least
+    wanted += COPIES * math.prod(grid.shape) * data.element_size()
+    if recipe.start == "linear":
+        wanted = max(wanted, bytes_of_linear_start(grid, config.acquisition, data.element_size()))
+    shape = "×".join(map(str, grid.shape))
+    memory.check_room(wanted, memory.free_bytes(data.device), f"Steps of a reconstruction of {shape} voxels")
 
 
 def _identity(config: Config, measured: Measured) -> str:

@@ -37,6 +37,7 @@ LAYERS = (
     "wrap_around",
     "passband",
     "imaging",
+    "memory",
     "microscope",
     "weak",
     "image_error",

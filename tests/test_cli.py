@@ -377,3 +377,24 @@ def test_light_that_cannot_be_followed_is_one_line_and_exit_code_2(run, write, p
     assert code == 2
     assert len(lines) == 1
     assert re.search(rf"error: {re.escape(str(path))}: {law}", lines[0])
+
+
+# --- memory ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkeypatch):
+    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: 2000)
+    line = refused("simulate", write())
+    assert "2 prism settings × 3 focus planes of 4×14×12 voxels" in line
+    assert "GiB are free" in line
+
+
+@pytest.mark.parametrize("start", ["linear", "zero"])
+def test_a_reconstruction_without_room_is_refused_before_it_begins(write, run, refused, monkeypatch, tmp_path, start):
+    run("simulate", write())
+    (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
+    before = sorted((tmp_path / "out").iterdir())
+    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: 2000)
+    line = refused("reconstruct", write({"reconstruction.start": start}))
+    assert "reconstruction of 4×14×12 voxels" in line
+    assert sorted((tmp_path / "out").iterdir()) == before

@@ -22,12 +22,12 @@ from torchdic import (
     Prism,
     Spectrum,
     Volume,
+    foreseen,
     image,
     imaging,
     landing,
 )
 from torchdic.caustics import Tubes
-from torchdic.recompute import TRANSIENT
 from torchdic.sampling import SliceSampler
 from torchdic.space_variant import object_levels
 
@@ -147,7 +147,8 @@ def test_bending_and_amplitude_are_paid_by_those_who_ask_for_them(delta):
     assert straight < bent / 3
     assert bent < whole
     bent, whole = (peak(taking(delta, propagation="rays", amplitude=amplitude)) for amplitude in (False, True))
-    assert bent < whole
+    # without gradients the most is held before the amplitude is made
+    assert bent <= whole
 
 
 def test_absorption_is_sampled_only_where_there_is_some(delta, counted, propagation):
@@ -184,13 +185,20 @@ def test_sources_share_their_transforms_and_evaluations(delta, counted, propagat
 def test_field_of_a_source_serves_every_prism_and_focus(delta, counted, propagation, count):
     """Propagation is paid once a batch; after it, one inverse transform per prism, focus and batch is all."""
     scope = directions(5)
-    # room for 2 sources at once: batches of 2, 2 and 1
-    memory = 2 * TRANSIENT * ROWS * COLUMNS * 8
     prisms, focus = ACQUISITION.prisms, [0.6, -0.9, 0.0]
+
+    def room(acquisition):
+        """A budget for 2 sources at once: batches of 2, 2 and 1."""
+        budgets = (int(1.05**i) for i in range(200, 500))
+        volume = Volume(GRID, delta, N0)
+        return next(
+            m for m in budgets if foreseen(volume, scope, acquisition, Fidelity(propagation, memory=m)).sources == 2
+        )
+
     with torch.no_grad():
         alone, several = (
-            counted(taking(delta, scope, Acquisition(prisms[:p], focus[:f]), propagation, memory=memory))
-            for p, f in ((1, 1), (3, count))
+            counted(taking(delta, scope, part, propagation, memory=room(part)))
+            for part in (Acquisition(prisms[:p], focus[:f]) for p, f in ((1, 1), (3, count)))
         )
         whole = counted(taking(delta, scope, Acquisition(prisms[:1], focus[:1]), propagation))
     assert Counter(several) == Counter(alone) + Counter(ifft2=3 * (3 * count - 1))

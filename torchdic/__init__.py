@@ -17,6 +17,7 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope, SamplingWarning
 from torchdic.jones import Polarisation
 from torchdic.jones_pupil import JonesPupil
+from torchdic.memory import Foreseen, ShortOfMemoryError, foreseen
 from torchdic.microscope import image, image_field
 from torchdic.objective import Layer, Objective, ThinLens, thin_lens
 from torchdic.plan import Plan, ToleranceWarning, plan
@@ -35,6 +36,7 @@ __all__ = [
     "Condenser",
     "Effect",
     "Fidelity",
+    "Foreseen",
     "Grid",
     "JonesPupil",
     "Layer",
@@ -45,11 +47,13 @@ __all__ = [
     "Prism",
     "Rays",
     "SamplingWarning",
+    "ShortOfMemoryError",
     "Spectrum",
     "ThinLens",
     "ToleranceWarning",
     "Trial",
     "Volume",
+    "foreseen",
     "image",
     "image_field",
     "launch",

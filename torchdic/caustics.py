@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.sampling import spline_coefficients, window
+from torchdic.sampling import window
 from torchdic.volume import Volume
 
 
@@ -62,15 +62,22 @@ class Tubes:
 
 
 @torch.no_grad()
-def tubes_that_may_fold(volume: Volume, momentum: Float[Tensor, "source 2"], fidelity: Fidelity) -> Tubes | None:
+def tubes_that_may_fold(
+    volume: Volume,
+    momentum: Float[Tensor, "source 2"],
+    fidelity: Fidelity,
+    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
+) -> Tubes | None:
     """Tubes to be followed through the volume, or None where there provably is no caustic in it.
+
+    fields: `Volume.sampled`, where it serves several calls.
 
     S = PQ⁻¹ obeys S' = −H_xx − H_xp S − S H_px − S H_pp S. So |S| is at most the solution of s' = c + 2a s + b s² where
     a, b, c bound |H_px|, |H_pp|, |H_xx| slice by slice. With s = p/q that is q' = −a q − b p, p' = c q + a p, from
     q = 1, p = 0. While q > 0, S is finite and Q has an inverse: a thin lens is cleared up to its very focus.
     """
     grid, n0 = volume.grid, float(volume.background)
-    field = spline_coefficients(volume.delta) if fidelity.interpolation == "cubic" else volume.delta
+    field = (fields or volume.sampled(fidelity.interpolation))[0]
     slices = torch.stack([_bounds(s, grid) for s in field.unbind(0)]).to("cpu", torch.float64)
     faces = [grid.centre(0, i - 0.5) for i in range(grid.shape[0] + 1)]
     seen = [window(grid, *ends, fidelity.interpolation) for ends in pairwise(faces)]

@@ -40,7 +40,10 @@ class Fidelity:
     reference_plane: depth in µm at which rays are turned into a field; None is the slice's centre or face nearest to
         the |Δn|-weighted mean depth.
     padding: voxels of the medium around the volume's sides on each side during the computation.
-    memory: bytes that one batch of sources may keep for the backward pass; above it slabs and batches are recomputed.
+    memory: bytes that an image may hold at once, its gradient included, beside the volume (see `torchdic.foreseen`).
+        Sources go in batches that stay within it, or within what is free if that is less, and batches are computed
+        again in the backward pass; if a single source wants more, so are its steps, slab by slab. Less than that can't
+        be had: a budget below it is exceeded.
     Raises ValueError where a value breaks its law.
     """
 

@@ -6,15 +6,17 @@ branches.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.caustics import tubes_that_may_fold
-from torchdic.fidelity import Fidelity
+from torchdic.fidelity import ADAPTIVE, Fidelity
 from torchdic.grid import Grid
-from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, launch
+from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, kept_by_rays, launch
+from torchdic.recompute import Demand, indices
 from torchdic.volume import Volume
 
 # Rows and columns of rays traced around the array, from where rays may be bent into it.
@@ -35,6 +37,7 @@ def ray_field(
     momentum: Float[Tensor, "source 2"],
     plane: float,
     fidelity: Fidelity,
+    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
     *,
     turned: bool = False,
 ) -> Complex[Tensor, "source *component y x"]:
@@ -43,15 +46,18 @@ def ray_field(
     Inside a triangle of the mesh the OPD is Σ w_i [W_i + ½ δp_i·(X − x_i)] with barycentric weights w_i, third order in
     the mesh, and the amplitude is √(p_z0/(p_z·|det ∂x_r/∂x0|)), which conserves energy.
 
-    turned: whether rays carry their polarisation. The field is then (source, 2, y, x), its components along +x and +y
-    of each ray's local frame for light that comes in along +x: (cos τ, sin τ) times the envelope (see `torchdic.rays`).
+    fields: `Volume.sampled`, where it serves several calls. turned: whether rays carry their polarisation. The field is
+    then (source, 2, y, x), its components along +x and +y of each ray's local frame for light that comes in along +x:
+    (cos τ, sin τ) times the envelope (see `torchdic.rays`).
     Raises TurnedRaysError for rays that can't go on toward +z in the volume or behind it, and SidewaysError for rays
     that come from too far beyond the volume's sides.
     """
     grid, n0 = volume.grid, volume.background
     p0 = momentum[:, None, None, :]
-    tubes = tubes_that_may_fold(volume, momentum, fidelity)
-    leaving = deviation(volume, launch(grid, momentum, n0, plane, MARGIN), fidelity, turn=turned, watch=tubes)
+    fields = fields or volume.sampled(fidelity.interpolation)
+    tubes = tubes_that_may_fold(volume, momentum, fidelity, fields)
+    rays = launch(grid, momentum, n0, plane, MARGIN)
+    leaving = deviation(volume, rays, fidelity, fields, turn=turned, watch=tubes)
     landed = extend(leaving, p0, n0, plane - grid.extent[0] / 2)
     trapped = ~torch.isfinite(landed.opd.detach())
     if bool(trapped.any()):
@@ -103,6 +109,42 @@ def ray_field(
         return summed(branches)
     turn = (weight * corners(landed.turn)).sum(-1)
     return torch.stack((summed(branches * turn.cos()), summed(branches * turn.sin())), 1)
+
+
+def demand_of_rays(volume: Volume, fidelity: Fidelity, *, turned: bool = False) -> Demand:
+    """What `ray_field` holds; measured by `python benchmarks/memory.py`."""
+    absorbs, index = volume.absorption is not None, indices(volume.delta.dtype)
+    _, ny, nx = volume.grid.shape
+    # of the padded array
+    area = (ny + 2 * fidelity.padding) * (nx + 2 * fidelity.padding)
+    sides = 2 * (fidelity.padding + MARGIN)
+    rays = (ny + sides) * (nx + sides) / area
+    steps = (None if fidelity.solver in ADAPTIVE else fidelity.steps) or volume.grid.shape[0]
+    step = kept_by_rays(volume.grid, fidelity, absorbs=absorbs) / steps
+    cubic = fidelity.interpolation == "cubic"
+    back = 190 + 20 * index if cubic else 60
+    forth = 120 + 25 * index if cubic else 80
+    # where rays go straight on, each corner of the two triangles beside a pixel falls on a pixel: 8 pairs instead of 2
+    empty = 1 - float((volume.delta.detach() != 0).any(0).sum()) / area
+    once = 10 + 12 * index + (10 + 15 * index) * (2 + 6 * empty)
+    kept = 77 + 12.5 * index + 11 * absorbs + 18 * turned - 20 * (not fidelity.amplitude)
+    return Demand(
+        rays * max(forth, 81 + 14 * absorbs + 13 * turned),
+        rays * kept,
+        rays * max(18, forth - kept),
+        steps,
+        rays * step,
+        rays * back,
+        rays * 2 * (5 + absorbs + turned),
+        once=rays * once,
+    )
+
+
+def reference_plane(volume: Volume, fidelity: Fidelity) -> float:
+    """Depth in µm to which the field behind a volume is referred: a wave's is the last face."""
+    if fidelity.propagation == "wave":
+        return volume.grid.extent[0] / 2
+    return volume.mean_plane() if fidelity.reference_plane is None else fidelity.reference_plane
 
 
 def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviation:
@@ -178,32 +220,39 @@ class _Mesh:
         A pixel on an edge belongs to one of the two triangles: an edge's side is computed from its vertices in the
         mesh's order, so both see the same number.
         """
-        moved = self.home + self.flat(displacement) / self.spacing
-        corner = moved[:, self.triangles]
+        # source by source: there are up to four pairs for each that holds
+        found = [self._covered_by_one(part) for part in self.home + self.flat(displacement) / self.spacing]
+        triangles, pixels = zip(*found, strict=True)
+        counts = torch.tensor([len(triangle) for triangle in triangles], device=displacement.device)
+        source = torch.repeat_interleave(torch.arange(len(found), device=displacement.device), counts)
+        return source, torch.cat(triangles), torch.cat(pixels)
+
+    def _covered_by_one(self, moved: Float[Tensor, "vertex 2"]) -> tuple[Tensor, Tensor]:
+        """`covered` of one source, whose vertices have been moved to fractional pixels: triangle (n,), pixel (n, 2)."""
+        corner = moved[self.triangles]
         limit = torch.tensor(self.shape, device=moved.device)
-        low = corner.amin(2).ceil().clamp_min(0)
-        high = torch.minimum(corner.amax(2).floor(), limit - 1)
+        low = corner.amin(1).ceil().clamp_min(0)
+        high = torch.minimum(corner.amax(1).floor(), limit - 1)
         extent = (high - low + 1).clamp_min(0).long()
-        count = extent.prod(-1).flatten()
-        pair = torch.repeat_interleave(torch.arange(len(count), device=moved.device), count)
-        within = torch.arange(len(pair), device=moved.device) - (count.cumsum(0) - count)[pair]
-        source, triangle = pair // len(self.triangles), pair % len(self.triangles)
-        width = extent.flatten(0, 1)[pair, 1]
+        count = extent.prod(-1)
+        triangle = torch.repeat_interleave(torch.arange(len(count), device=moved.device), count)
+        within = torch.arange(len(triangle), device=moved.device) - (count.cumsum(0) - count)[triangle]
+        width = extent[triangle, 1]
         offset = torch.stack((within // width, within % width), -1)
-        pixel = low.flatten(0, 1)[pair].long() + offset
+        pixel = low[triangle].long() + offset
 
         vertex = self.triangles[triangle]
-        inside = torch.ones(len(pair), dtype=torch.bool, device=moved.device)
-        orientation = _cross(*(corner[:, :, 1:] - corner[:, :, :1]).unbind(2))[source, triangle] > 0
+        inside = torch.ones(len(triangle), dtype=torch.bool, device=moved.device)
+        orientation = _cross(*(corner[:, 1:] - corner[:, :1]).unbind(1))[triangle] > 0
         for first, second in ((0, 1), (1, 2), (2, 0)):
             one, other = vertex[:, first], vertex[:, second]
-            start, end = moved[source, torch.minimum(one, other)], moved[source, torch.maximum(one, other)]
+            start, end = moved[torch.minimum(one, other)], moved[torch.maximum(one, other)]
             # taken from the nearer end: a ray that lands almost on a pixel would drown in the rounding of the other
             direct = (pixel - start).square().sum(-1) <= (pixel - end).square().sum(-1)
             arm = pixel - torch.where(direct[:, None], start, end)
             left = torch.where(direct, 1, -1) * _cross(torch.where(direct[:, None], end - start, start - end), arm) >= 0
             inside &= (left == (one < other)) == orientation
-        return source[inside], triangle[inside], pixel[inside]
+        return triangle[inside], pixel[inside]
 
 
 def _crossed(leaving: Tensor, landed: Tensor) -> Tensor:

@@ -1,5 +1,7 @@
 """The whole microscope: from a specimen to the images of its prisms and focus planes."""
 
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -10,18 +12,16 @@ from torch import Tensor
 from torchdic.camera import Camera
 from torchdic.fidelity import STANDARD, Fidelity
 from torchdic.grid import Grid
-from torchdic.imaging import form_image, kept_by_imaging
+from torchdic.imaging import form_image
 from torchdic.instrument import Acquisition, Microscope, check_apertures, check_sampling
-from torchdic.landing import ray_field
+from torchdic.landing import ray_field, reference_plane
+from torchdic.memory import Foreseen, allotted, allotted_to_fields, levels_of
 from torchdic.passband import interpolate
-from torchdic.projection import kept_by_projection, project
-from torchdic.rays import kept_by_rays
+from torchdic.projection import project
 from torchdic.recompute import sum_over_sources
-from torchdic.space_variant import Levels, object_levels
+from torchdic.space_variant import Levels
 from torchdic.volume import Volume
-from torchdic.wave import axial_difference, kept_by_wave, paraxial_difference, split_step, to_spectrum
-
-KEPT = {"projection": kept_by_projection, "rays": kept_by_rays, "wave": kept_by_wave}
+from torchdic.wave import axial_difference, paraxial_difference, split_step, to_spectrum
 
 
 def image(
@@ -30,38 +30,45 @@ def image(
     """Images of a volume, relative to the empty bright field.
 
     Pixels are the volume's (y, x) voxel centres, or those of a camera that has a pixel size. Raises ValueError where an
-    aperture exceeds the medium's index; warns with SamplingWarning where the voxels are coarser than the light.
+    aperture exceeds the medium's index, and ShortOfMemoryError where it would take more memory than is free; warns with
+    SamplingWarning where the voxels are coarser than the light.
     """
     check_apertures(microscope, float(volume.background.detach()), volume.delta.dtype)
     check_sampling(microscope, volume.grid)
-    if microscope.spectrum is None:
-        return _image(volume, microscope, acquisition, fidelity)
+    plan = allotted(volume, microscope, acquisition, fidelity)
     colours = microscope.colours()
-    fidelity = replace(fidelity, memory=max(1, fidelity.memory // len(colours)))
-    images = [share * _image(volume, part, acquisition, fidelity) for part, share in colours]
+    plane = reference_plane(volume, fidelity)
+    padded = _padded(volume, fidelity.padding)
+    levels: list[Levels | None] = [None] * len(colours)
+    if fidelity.object_aberration is not None:
+        levels = [levels_of(padded, plane, part, fidelity) for part, _ in colours]
+        plan = allotted(volume, microscope, acquisition, fidelity, max(len(part.defocus) for part in levels if part))
+    images = [
+        share * _image(padded, plane, part, acquisition, fidelity, own, plan)
+        for (part, share), own in zip(colours, levels, strict=True)
+    ]
     return images[0] if len(images) == 1 else torch.stack(images).sum(0)
 
 
 def _image(
-    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
+    volume: Volume,
+    plane: float,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    fidelity: Fidelity,
+    levels: Levels | None,
+    plan: Foreseen,
 ) -> Float[Tensor, "prism focus y x"]:
-    """`image` in light of one wavelength."""
-    pad = fidelity.padding
-    volume = _padded(volume, pad)
+    """`image` of a padded volume in light of one wavelength."""
     momentum, weights = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
-    plane = fidelity.reference_plane
-    if fidelity.propagation == "wave":
-        plane = volume.grid.extent[0] / 2
-    elif plane is None:
-        plane = volume.mean_plane()
-
-    levels = None
-    if fidelity.object_aberration is not None:
-        parts = microscope.wavelength, microscope.objective, microscope.condenser
-        levels = object_levels(volume, plane, *parts, momentum, fidelity)
+    fields = None if fidelity.propagation == "wave" else volume.sampled(fidelity.interpolation)
+    # whether steps are computed again has been decided
+    within = replace(fidelity, memory=1 if plan.slabs else sys.maxsize)
 
     def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
-        spectrum = propagate(volume, microscope.wavelength, momentum, plane, fidelity, levels, turned=microscope.turns)
+        spectrum = propagate(
+            volume, microscope.wavelength, momentum, plane, within, levels, fields, turned=microscope.turns
+        )
         return form_image(
             spectrum,
             volume.grid,
@@ -75,11 +82,8 @@ def _image(
             band_limit=fidelity.band_limit,
         )
 
-    components = 2 if microscope.turns and fidelity.propagation == "rays" else 1
-    kept = KEPT[fidelity.propagation](volume.grid, fidelity) + kept_by_imaging(microscope, acquisition, components)
-    kept += 0 if levels is None else components * levels.kept
-    total = sum_over_sources(intensity, (momentum, weights), volume.delta[0].numel(), kept, fidelity.memory)
-    return _seen(total, volume.grid, pad, microscope.camera)
+    total = sum_over_sources(intensity, (momentum, weights), plan.sources)
+    return _seen(total, volume.grid, fidelity.padding, microscope.camera)
 
 
 def propagate(
@@ -89,21 +93,23 @@ def propagate(
     plane: float,
     fidelity: Fidelity,
     levels: Levels | None = None,
+    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
     *,
     turned: bool = False,
 ) -> Complex[Tensor, "source *component y x"]:
     """Spectrum of each source's envelope behind the specimen, referred to depth `plane` (the last face for a wave).
 
-    levels: of the defocus with which each point of a field that rays make spreads. turned: whether bent rays carry
+    levels: of the defocus with which each point of a field that rays make spreads. fields: `Volume.sampled`, where it
+    serves several calls. turned: whether bent rays carry
     their polarisation. Theirs is then (source, 2, y, x), the components along +x and +y of light that comes in along
     +x; the other ways across the specimen stay scalar.
     """
     if fidelity.propagation == "wave":
         return split_step(volume, wavelength, momentum, fidelity)
     if fidelity.propagation == "projection":
-        field = project(volume, wavelength, momentum, plane, fidelity)
+        field = project(volume, wavelength, momentum, plane, fidelity, fields)
     else:
-        field = ray_field(volume, wavelength, momentum, plane, fidelity, turned=turned)
+        field = ray_field(volume, wavelength, momentum, plane, fidelity, fields, turned=turned)
     if levels is None:
         return to_spectrum(field)
     if fidelity.defocus == "paraxial":
@@ -146,6 +152,7 @@ def image_field(
     n0 = torch.as_tensor(background, dtype=real.dtype, device=real.device)
     pad = fidelity.padding
     grid = grid.widened(pad, pad)
+    plan = allotted_to_fields(transmission, grid, len(weights), microscope, acquisition, fidelity)
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
@@ -153,8 +160,7 @@ def image_field(
         return form_image(spectra, grid, n0, 0.0, momentum, weights, *scene, band_limit=fidelity.band_limit)
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
-    kept = kept_by_imaging(microscope, acquisition)
-    total = sum_over_sources(intensity, (momentum, weights, own), own[0].numel(), kept, fidelity.memory)
+    total = sum_over_sources(intensity, (momentum, weights, own), plan.sources)
     return _seen(total, grid, pad, microscope.camera)
 
 

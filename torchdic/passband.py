@@ -39,12 +39,11 @@ class Passband:
     @classmethod
     def around(cls, grid: Grid, wavelength: float, na: float, momentum: Float[Tensor, "source 2"]) -> "Passband | None":
         """The window of each source's |λf + p0| ≤ na; None where it would be most of the array."""
-        _, ny, nx = grid.shape
-        # bins of frequency from the disc's middle to its edge, and whole ones that lie across it at most
-        radii = [na * (1 + _MARGIN) * extent / wavelength for extent in grid.extent[1:]]
-        widths = [min(n, math.floor(2 * radius) + 1) for n, radius in zip((ny, nx), radii, strict=True)]
-        if math.prod(widths) > WORTHWHILE * ny * nx:
+        found = sizes(grid, wavelength, na)
+        if found is None:
             return None
+        widths, shape = found
+        radii, (_, ny, nx) = _radii(grid, wavelength, na), grid.shape
         rows, columns = (
             torch.ceil(-momentum[:, axis].detach().double() * grid.extent[1 + axis] / wavelength - radii[axis]).long()
             for axis in (0, 1)
@@ -55,10 +54,6 @@ class Passband:
         )
         indices = rows[:, :, None] * nx + columns[:, None, :]
         frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device).flatten(1)[:, indices]
-        fine = [
-            min(n, cast(int, scipy.fft.next_fast_len(2 * width - 1))) for n, width in zip((ny, nx), widths, strict=True)
-        ]
-        shape = (fine[0], fine[1]) if math.prod(fine) <= WORTHWHILE * ny * nx else (ny, nx)
         return cls(indices, frequencies.movedim(0, 1), shape)
 
     def window(self, spectrum: Complex[Tensor, "*component source y x"]) -> Complex[Tensor, "*component source v u"]:
@@ -66,6 +61,22 @@ class Passband:
         # an index keeps less than `gather` does, whose backward pass holds on to the whole spectrum
         sources = torch.arange(len(self.indices), device=spectrum.device)[:, None, None]
         return spectrum.flatten(-2)[..., sources, self.indices]
+
+
+def sizes(grid: Grid, wavelength: float, na: float) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Shapes (y, x) of a source's window and of the array for its intensities; None where nothing would be gained."""
+    ny, nx = grid.shape[1:]
+    # whole bins of frequency that lie across the disc at most
+    v, u = (min(n, math.floor(2 * r) + 1) for n, r in zip((ny, nx), _radii(grid, wavelength, na), strict=True))
+    if v * u > WORTHWHILE * ny * nx:
+        return None
+    rows, columns = (min(n, cast(int, scipy.fft.next_fast_len(2 * m - 1))) for n, m in ((ny, v), (nx, u)))
+    return (v, u), (rows, columns) if rows * columns <= WORTHWHILE * ny * nx else (ny, nx)
+
+
+def _radii(grid: Grid, wavelength: float, na: float) -> list[float]:
+    """Bins of frequency from the disc's middle to its edge, along y and x."""
+    return [na * (1 + _MARGIN) * extent / wavelength for extent in grid.extent[1:]]
 
 
 def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int, int]) -> Float[Tensor, "*image y x"]:

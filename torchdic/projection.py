@@ -4,30 +4,34 @@ It is the limit of the ray equations for weak contrast, where dW/dz = √(n² �
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
-from torchdic.grid import Grid
 from torchdic.rays import TurnedRaysError, axial_momentum
-from torchdic.recompute import recompute, slabs
-from torchdic.sampling import SliceSampler, spline_coefficients
+from torchdic.recompute import Demand, indices, recompute, slabs
+from torchdic.sampling import SliceSampler
 from torchdic.volume import Volume
 
 
 def project(
-    volume: Volume, wavelength: float, momentum: Float[Tensor, "source 2"], plane: float, fidelity: Fidelity
+    volume: Volume,
+    wavelength: float,
+    momentum: Float[Tensor, "source 2"],
+    plane: float,
+    fidelity: Fidelity,
+    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
 ) -> Complex[Tensor, "source y x"]:
     """Each source's envelope as seen at depth `plane` (µm).
 
+    fields: `Volume.sampled`, where it serves several calls.
     Raises TurnedRaysError where the index on a ray falls below its transverse momentum.
     """
     grid, n0 = volume.grid, volume.background
-    fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
-    if fidelity.interpolation == "cubic":
-        fields = [spline_coefficients(f) for f in fields]
+    fields = fields or volume.sampled(fidelity.interpolation)
     samplers = [SliceSampler(grid, f.unbind(0), fidelity.interpolation) for f in fields]
 
     y, x = (grid.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
@@ -52,7 +56,7 @@ def project(
     zero = momentum.new_zeros(wide)
     sums = tuple(zero for _ in samplers)
     steps = grid.shape[0]
-    crowded = kept_by_projection(grid, fidelity) * zero.numel() * zero.element_size() > fidelity.memory
+    crowded = demand_of_projection(volume, fidelity).whole * zero.numel() * zero.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
         sums = recompute(cross, first, last, *sums, when=crowded)
     stopped = ~torch.isfinite(sums[0].detach())
@@ -63,6 +67,13 @@ def project(
     return torch.polar(amplitude, k0 * sums[0])
 
 
-def kept_by_projection(grid: Grid, fidelity: Fidelity) -> int:
-    """Values per source and pixel that autograd keeps for the backward pass."""
-    return 9 * grid.shape[0]
+def demand_of_projection(volume: Volume, fidelity: Fidelity) -> Demand:
+    """What `project` holds; measured by `python benchmarks/memory.py`."""
+    absorbs, index = volume.absorption is not None, indices(volume.delta.dtype)
+    steps = volume.grid.shape[0]
+    if fidelity.interpolation == "linear":
+        return Demand(10 + 2 * absorbs, 4 + absorbs, 10, steps, 8 + 2 * absorbs, 10, 1 + absorbs, shared=1)
+    # a spline's 16 voxels, their places and weights
+    working = 43 + 8 * index + 44 * absorbs
+    step = 14 + 16 * index + 2 * absorbs
+    return Demand(64 + 24 * index + 2 * absorbs, 4 + absorbs, working, steps, step, working, 1 + absorbs)

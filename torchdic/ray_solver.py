@@ -103,17 +103,16 @@ class _EqualSteps(torch.autograd.Function):
             return equation.slopes(met)
 
         end = equal_steps(slopes, state, depths, solver)
-        ctx.settings = equation, depths, solver
+        ctx.settings = _maker(equation), depths, solver
         ctx.save_for_backward(*tensors, *kept)
         return end
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, state_bar: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        equation, depths, solver = ctx.settings
-        saved, tensors = ctx.saved_tensors, len(equation.tensors)
-        equation = _of(equation, saved[:tensors])
-        kept = list(saved[tensors:])
+        make, depths, solver = ctx.settings
+        saved = ctx.saved_tensors
+        equation, kept = make(saved)
         del saved
         gradients = _Gradients(equation)
         a, b = TABLEAUX[solver]
@@ -148,16 +147,16 @@ class _EqualSteps(torch.autograd.Function):
 class _Evaluation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, equation: RayEquation, z: float, state: Tensor, *tensors: Tensor) -> Tensor:
-        ctx.settings = equation, z
+        ctx.settings = _maker(equation), z
         ctx.save_for_backward(state, *tensors)
         return equation.slopes(equation.meet(z, state[:MOVING]))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, slopes_bar: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        equation, z = ctx.settings
+        make, z = ctx.settings
         state, *tensors = ctx.saved_tensors
-        equation = _of(equation, tensors)
+        equation, _ = make(tensors)
         gradients = _Gradients(equation)
         pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), slopes_bar[:MOVING], slopes_bar[MOVING:], 1.0)
         gradients.add(z, pulled)
@@ -206,16 +205,25 @@ def _advanced(moving: Tensor, slopes: Sequence[Tensor], row: Sequence[float], h:
     return moved
 
 
-def _of(equation: RayEquation, tensors: Sequence[Tensor]) -> RayEquation:
-    """The equation on its tensors as autograd hands them back."""
-    straight, background, *slices = tensors
-    index = equation.index
+def _maker(equation: RayEquation) -> Callable[[Sequence[Tensor]], tuple[RayEquation, list[Tensor]]]:
+    """What makes the equation anew of its tensors as autograd hands them back, and tells what comes behind them.
+
+    It holds no tensor itself: those of a solution that is computed again would be held until then.
+    """
+    index, face, turn = equation.index, equation.face, equation.turn
+    grid, interpolation, first = index.grid, index.interpolation, index.first
+    fields = 1 + (equation.absorption is not None)
     own = len(index.slices)
-    samplers = [
-        SliceSampler(index.grid, part, index.interpolation, index.first) if part else None
-        for part in (slices[:own], slices[own:])
-    ]
-    return replace(equation, straight=straight, background=background, index=samplers[0], absorption=samplers[1])
+
+    def make(tensors: Sequence[Tensor]) -> tuple[RayEquation, list[Tensor]]:
+        straight, background, *others = tensors
+        samplers = [
+            SliceSampler(grid, others[field * own : (field + 1) * own], interpolation, first) for field in range(fields)
+        ]
+        absorption = samplers[1] if fields > 1 else None
+        return RayEquation(straight, background, samplers[0], absorption, face, turn), others[fields * own :]
+
+    return make
 
 
 def _ends(depths: Tensor, state: Tensor) -> Tensor:

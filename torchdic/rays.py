@@ -18,9 +18,8 @@ sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
     dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)),    without the singularity of s and p on the axis.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,7 +30,7 @@ from torchdic.grid import Grid
 from torchdic.ray_equation import RayEquation
 from torchdic.ray_solver import TABLEAUX, solve
 from torchdic.recompute import recompute, slabs
-from torchdic.sampling import SliceSampler, spline_coefficients, window
+from torchdic.sampling import SliceSampler, window
 from torchdic.volume import Volume
 
 
@@ -121,19 +120,18 @@ def deviation(
     volume: Volume,
     rays: Rays,
     fidelity: Fidelity,
+    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
     *,
     turn: bool = False,
     watch: Callable[[Tensor], None] | None = None,
 ) -> Deviation:
     """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`.
 
-    turn: whether to find τ too. watch: is shown (δy, δx, δp_y, δp_x), shape (4, …) and without a graph, after each step
-    or, by an adaptive solver, at the slices' faces.
+    fields: `Volume.sampled`, where it serves several calls. turn: whether to find τ too. watch: is shown (δy, δx, δp_y,
+    δp_x), shape (4, …) and without a graph, after each step or, by an adaptive solver, at the slices' faces.
     """
     grid, n0 = volume.grid, volume.background
-    fields = [volume.delta] if volume.absorption is None else [volume.delta, volume.absorption]
-    if fidelity.interpolation == "cubic":
-        fields = [spline_coefficients(f) for f in fields]
+    fields = fields or volume.sampled(fidelity.interpolation)
     slices = [f.unbind(0) for f in fields]
     face = -grid.extent[0] / 2
     # y and x apart: the solution is spent on sums over pairs otherwise
@@ -141,7 +139,20 @@ def deviation(
     pz0 = axial_momentum(n0, rays.momentum).expand(momentum.shape[1:])
     straight = torch.cat((position, momentum / pz0, momentum, pz0[None]))
 
+    watched = 0
+
     def cross(first: int, last: int, state: Tensor) -> Tensor:
+        nonlocal watched
+        if watch is None:
+            return advance(first, last, state)
+        for step in range(first, last):
+            state = advance(step, step + 1, state)
+            if step == watched:  # not when it is computed again
+                watch(state[:4].detach())
+                watched += 1
+        return state
+
+    def advance(first: int, last: int, state: Tensor) -> Tensor:
         times = depths[first : last + 1]
         # an adaptive solver looks beyond the end of its last step
         seen = times if equal_steps else depths
@@ -158,10 +169,8 @@ def deviation(
     depths[-1] = -face
     kept = kept_by_rays(grid, fidelity, absorbs=volume.absorption is not None)
     crowded = kept * state[0].numel() * state.element_size() > fidelity.memory
-    for first, last in pairwise(range(steps + 1)) if watch else slabs(steps, split=crowded and equal_steps):
+    for first, last in slabs(steps, split=crowded and equal_steps):
         state = recompute(cross, first, last, state, when=crowded)
-        if watch:
-            watch(state[:4].detach())
     stopped = ~torch.isfinite(state[4])
     if bool(stopped.any()):
         raise TurnedRaysError.of(stopped)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
 
@@ -10,8 +11,39 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 T = TypeVar("T")
-# Values per source and pixel that a pass without gradients holds at once.
-TRANSIENT = 60
+
+
+@dataclass(frozen=True)
+class Demand:
+    """Values per source and pixel that a stage of the computation holds; 1 is a real number of the volume's dtype.
+
+    alone: at most, where no gradient is wanted. kept: for the backward pass, and each of `steps` steps keeps `step`
+    more. working: at most beside all that is kept. back: at most beside the steps' part alone, while the backward pass
+    takes them back. carried: from slab to slab of steps that are computed again. shared: kept (by each step, if any),
+    however many sources there are. captured: kept even of batches that are computed again. once: at most
+    beside the steps' part, or alone, by one source after the other.
+    """
+
+    alone: float
+    kept: float
+    working: float
+    steps: int = 0
+    step: float = 0
+    back: float = 0
+    carried: float = 0
+    shared: float = 0
+    captured: float = 0
+    once: float = 0
+
+    @property
+    def whole(self) -> float:
+        """All that is kept."""
+        return self.kept + self.steps * self.step
+
+
+def indices(dtype: torch.dtype) -> float:
+    """How many values of a dtype an index takes."""
+    return torch.int64.itemsize / dtype.itemsize
 
 
 def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
@@ -28,18 +60,9 @@ def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
     yield from pairwise(edges)
 
 
-def sum_over_sources(
-    function: Callable[..., Tensor], per_source: tuple[Tensor, ...], pixels: int, kept: int, memory: int
-) -> Tensor:
-    """Σ of function(batch of each tensor) over batches of sources.
-
-    pixels: of one source's field. kept: values per pixel and source that the backward pass wants. memory: bytes that
-    the batches may keep together; where they want more, each batch is as large as fits and computed again.
-    """
+def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
+    """Σ of function(batch of each tensor) over batches of `size` sources; several are computed again when needed."""
     count = len(per_source[0])
-    values = kept if torch.is_grad_enabled() else TRANSIENT
-    each = values * pixels * per_source[0].element_size()
-    size = min(count, max(1, memory // each))
     batches = zip(*(t.split(size) for t in per_source), strict=True)
     total = recompute(function, *next(batches), when=size < count)
     for batch in batches:

@@ -21,10 +21,11 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from torchdic.aberration import CAREFUL, effective_defocus
+from torchdic.aberration import AZIMUTHS, CAREFUL, KEPT_BY_PAIR, KEPT_BY_RAY, RINGS, effective_defocus
 from torchdic.condenser import Condenser
 from torchdic.fidelity import Fidelity
 from torchdic.objective import Objective
+from torchdic.recompute import Demand
 from torchdic.volume import Volume
 from torchdic.wave import exp_i, to_spectrum
 
@@ -59,7 +60,22 @@ class Levels:
     @property
     def kept(self) -> int:
         """Values per source and pixel that autograd keeps for the backward pass."""
-        return 5 * len(self.defocus) + 4
+        return kept_by_levels(len(self.defocus))
+
+
+def kept_by_levels(count: int) -> int:
+    """`Levels.kept` of so many levels."""
+    return 5 * count + 4
+
+
+def demand_of_map(volume: Volume, plane: float, fidelity: Fidelity) -> Demand:
+    """What the map of a volume's own aberration holds, per pixel: it serves all sources."""
+    share = (volume.grid.extent[0] / 2 - plane) / volume.grid.extent[0]
+    steps = math.ceil((fidelity.steps or volume.grid.shape[0]) * share - 1e-9)
+    if fidelity.object_aberration == "cone":
+        rays = 1 + len(RINGS) * AZIMUTHS
+        return Demand(150 * rays, 30 * rays, 0, steps, KEPT_BY_RAY["cubic"] * rays, carried=10 * rays)
+    return Demand(250, 150, 0, steps, KEPT_BY_PAIR, carried=26)
 
 
 def object_levels(

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchdic.grid import Grid
+from torchdic.sampling import Interpolation, spline_coefficients
 
 
 class Volume(nn.Module):
@@ -50,6 +51,11 @@ class Volume(nn.Module):
             self.register_parameter(name, value)
         else:
             self.register_buffer(name, value)
+
+    def sampled(self, interpolation: Interpolation) -> list[Float[Tensor, "z y x"]]:
+        """Δn, and κ if there is any, as a `SliceSampler` wants them: voxels, or a spline's coefficients."""
+        fields = [self.delta] if self.absorption is None else [self.delta, self.absorption]
+        return [spline_coefficients(f) for f in fields] if interpolation == "cubic" else fields
 
     def mean_plane(self) -> float:
         """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 where Δn is 0 everywhere.

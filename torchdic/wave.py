@@ -16,7 +16,7 @@ from torch import Tensor
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import axial_momentum
-from torchdic.recompute import recompute, slabs
+from torchdic.recompute import Demand, recompute, slabs
 from torchdic.volume import Volume
 
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
@@ -164,7 +164,8 @@ def split_step(
 
     S = torch.zeros_like(H)
     S[:, 0, 0] = 1
-    crowded = kept_by_wave(volume.grid, fidelity) * pz.numel() * pz.element_size() > fidelity.memory
+    kept = demand_of_wave(volume, momentum, fidelity).whole
+    crowded = kept * pz.numel() * pz.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
         S = recompute(cross, first, last, S, when=crowded)
     _check_energy(S.detach(), pz, volume, momentum, steps)
@@ -202,9 +203,24 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
     )
 
 
-def kept_by_wave(grid: Grid, fidelity: Fidelity) -> int:
-    """Values per source and pixel that autograd keeps for the backward pass."""
-    return {1: 10, 2: 13}[fidelity.order] * (fidelity.steps or grid.shape[0])
+def demand_of_wave(volume: Volume, momentum: Tensor, fidelity: Fidelity) -> Demand:
+    """What `split_step` holds; measured by `python benchmarks/memory.py`."""
+    absorbs, steps = volume.absorption is not None, fidelity.steps or volume.grid.shape[0]
+    # of a screen's and a propagator's own derivatives
+    medium = volume.background.requires_grad or momentum.requires_grad
+    alone, kept, working, step = {1: (19, 2, 14, 9), 2: (20, 5, 11, 12)}[fidelity.order]
+    working += absorbs
+    return Demand(
+        alone + absorbs,
+        kept + 9 * medium,
+        working,
+        steps,
+        step + 2 * absorbs + 6 * medium,
+        working,
+        carried=2,
+        shared=3 + 3 * absorbs,
+        captured=3,
+    )
 
 
 def slab_mean(slices: Sequence[Tensor], step: int, steps: int) -> Tensor:

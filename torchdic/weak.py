@@ -202,7 +202,9 @@ def _kernel(
         through = (weights * microscope.objective.aperture(momentum[:, :, None, None])[:, 0, 0]).sum()
     planes = len(depths) + grid.shape[0] + len(foci)
     pixels = grid.shape[1] * grid.shape[2]
-    M = sum_over_sources(contribution, (momentum, weights), pixels, 4 * planes, fidelity.memory)
+    # complex planes and the phases that they are made of
+    each = 4 * planes * pixels * momentum.element_size()
+    M = sum_over_sources(contribution, (momentum, weights), max(1, fidelity.memory // each))
     return M, through
 
 
