@@ -117,6 +117,19 @@ def test_rays_through_nothing_are_foreseen_too():
         assert foreseen(volume, scope, ACQUISITION, Fidelity("rays")).peak / bytes_ == pytest.approx(1, abs=0.3)
 
 
+def test_without_a_gradient_batches_stay_in_the_caches_and_images_are_the_same(specimen, monkeypatch):
+    volume, fidelity = specimen(torch.float64), Fidelity("wave")
+    whole = foreseen(volume, SCOPE, ACQUISITION, fidelity)
+    images = image(volume, SCOPE, ACQUISITION, fidelity)
+    monkeypatch.setattr(memory, "CACHED", whole.peak // 2)
+    found = foreseen(volume, SCOPE, ACQUISITION, fidelity)
+    assert 1 <= found.sources < whole.sources == 5
+    assert found.peak <= whole.peak // 2
+    torch.testing.assert_close(image(volume, SCOPE, ACQUISITION, fidelity), images, rtol=0, atol=1e-13)
+    # with one they are as large as the budget allows
+    assert foreseen(specimen(torch.float64, learned=True), SCOPE, ACQUISITION, fidelity).sources == 5
+
+
 def test_a_smaller_budget_makes_smaller_batches_then_slabs(specimen):
     volume, fidelity = specimen(learned=True), Fidelity("wave")
     whole = foreseen(volume, SCOPE, ACQUISITION, fidelity)

@@ -440,13 +440,6 @@ def test_directions_are_counted_as_the_microscope_makes_them(condenser, sources)
     assert directions(microscope, sources) == len(made)
 
 
-def test_sources_in_batches_that_stay_in_cache_give_the_same_images():
-    scene = cell()
-    fidelity = Fidelity(sources=72, order=1)
-    pilot = pilots.Scene(scene.volume, scene.microscope, scene.acquisition)
-    assert image_error(pilot(fidelity), scene.image(fidelity)) < 1e-5
-
-
 # its manners
 
 

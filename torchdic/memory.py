@@ -30,6 +30,9 @@ from torchdic.volume import Volume
 from torchdic.wave import demand_of_wave
 
 GIB = 1 << 30
+# Bytes that a batch of fields on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches,
+# up to 1.4 times as fast (192² pixels, 50 sources). Rays, at work on one mesh after the other, gain nothing.
+CACHED = 32 << 20
 
 
 class ShortOfMemoryError(MemoryError):
@@ -357,7 +360,10 @@ def _foreseen(
     momentum, _ = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
     scene = _scene(volume, microscope, acquisition, fidelity, momentum, levels, gradient)
     _, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
-    return _fitted(scene, ny * nx * volume.delta.element_size(), fidelity.memory)
+    budget = fidelity.memory
+    if not scene.learned and fidelity.propagation != "rays" and volume.delta.device.type == "cpu":
+        budget = min(budget, CACHED)
+    return _fitted(scene, ny * nx * volume.delta.element_size(), budget)
 
 
 def _fitted(scene: _Scene, each: int, budget: int) -> Foreseen:

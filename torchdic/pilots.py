@@ -22,8 +22,6 @@ WINDOW = 64
 COARSE = 4
 # Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
 MOST, MOST_UNSTABLE = 8, 32
-# Bytes that a batch of a pilot's sources takes on a CPU, to stay in its cache: half the time of a batch of all.
-CACHE = 16 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +37,8 @@ class Scene:
     def __call__(self, fidelity: Fidelity) -> Tensor:
         """Images, (prism, focus, y, x). Raises UnstableError as `image` does."""
         if fidelity not in self._seen:
-            on_cpu = self.volume.delta.device.type == "cpu"
-            batched = replace(fidelity, memory=CACHE) if on_cpu else fidelity
             try:
-                self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, batched)
+                self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, fidelity)
             except UnstableError:
                 self._unstable.add(fidelity)
                 raise
