@@ -1,5 +1,6 @@
 """The split step against the Helmholtz equation's own laws: first Born, energy, orders, and the meaning of a slab."""
 
+import cmath
 import math
 from itertools import pairwise
 
@@ -205,3 +206,22 @@ def test_slabs_that_lose_energy_are_warned_about():
     with pytest.warns(SlabWarning, match=r"slabs of 0.4 µm are too thick .* nothing absorbs; use more than 16 steps"):
         split_step(volume, WAVELENGTH, momentum(), Fidelity(order=1))
     split_step(volume, WAVELENGTH, momentum(), Fidelity())
+
+
+@pytest.mark.parametrize("index", [1.4, 1.36, 1.0, 0.9])
+@pytest.mark.parametrize("kappa", [1e-6, 0.05])
+def test_light_through_an_absorbing_layer_takes_its_complex_axial_momentum(index, kappa, dtype):
+    """exp(ik0·T·(√((n + iκ)² − |p0|²) − p_z0)), also where the layer alone would turn the light back."""
+    grid, p0 = Grid((4, 6, 8), (0.05, 0.3, 0.28)), 1.0
+    n = torch.full(grid.shape, index - N0, dtype=dtype).requires_grad_()
+    k = torch.full(grid.shape, kappa, dtype=dtype).requires_grad_()
+    S = split_step(Volume(grid, n, N0, k), WAVELENGTH, momentum([0.0, p0], dtype=dtype), Fidelity("wave"))[0, 0, 0]
+    axial_inside = cmath.sqrt(complex(index, kappa) ** 2 - p0**2)
+    expected = cmath.exp(1j * K0 * 0.2 * (axial_inside - axial(p0**2)))
+    eps = torch.finfo(dtype).eps
+    # rounding of n² − |p0|² is magnified by its root
+    assert abs(complex(S.detach()) - expected) < 64 * eps * abs(K0 * 0.2 / axial_inside)
+    slope = torch.autograd.grad(S.real, [n, k])
+    d = 1j * K0 * 0.2 * complex(index, kappa) / axial_inside * expected
+    for found, exact in zip(slope, (d.real, (1j * d).real), strict=True):
+        assert abs(float(found.sum()) - exact) < 2048 * eps * abs(d) / abs(axial_inside) ** 2
