@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchdic.recompute import recompute, slabs, sum_over_sources
+from torchdic.recompute import recompute, replay, slabs, sum_over_sources
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 10, 17, 100])
@@ -46,6 +46,27 @@ def test_recomputed_values_are_not_kept():
     assert len(calls) == 3
     recompute(counted, x, when=False).sum().backward()
     assert len(calls) == 4
+
+
+def test_replayed_values_build_no_graph_and_leave_the_gradient_as_it_is():
+    x, y = (torch.rand(7, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    fixed, unused = torch.rand(7, dtype=torch.float64), torch.rand(7, requires_grad=True)
+    graphs = []
+
+    def function(a, b, c, _):
+        result = (a * b.sin() + c).exp()
+        graphs.append(result.requires_grad)
+        return result
+
+    # y reaches the result along two ways, one of them through the first argument
+    expected = torch.autograd.grad(function(x * y, y, fixed, unused).square().sum(), [x, y])
+    found = replay(function, x * y, y, fixed, unused, when=True)
+    gradient = torch.autograd.grad(found.square().sum(), [x, y, unused], allow_unused=True)
+    assert gradient[2] is None
+    assert all(torch.equal(a, b) for a, b in zip(gradient[:2], expected, strict=True))
+    assert graphs == [True, False, True]
+    with torch.no_grad():
+        assert not replay(function, x, y, fixed, unused, when=True).requires_grad
 
 
 @pytest.mark.parametrize("size", [1, 6, 7])

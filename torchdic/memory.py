@@ -268,7 +268,6 @@ class _Scene:
             + slabs * (1 - longest / steps) * self.slices,
         )
         if several:
-            found += self.colours * self.sources * crossing.captured
             return self.aside + max(found + self.slices, 3 * self.slices, imaging.once, self.before)
         return self.aside + max(found + others, 2 * self.slices, imaging.once, self.before)
 
@@ -372,14 +371,15 @@ def _fitted(scene: _Scene, each: int, budget: int) -> Foreseen:
     def peak(batch: int, *, slabs: bool = False) -> int:
         return math.ceil(scene.values(batch, slabs=slabs) * each)
 
-    # a single source's steps in slabs, where that holds less
-    slabs = scene.crosses and peak(1, slabs=True) < peak(1)
-    least = peak(1, slabs=slabs)
-    if scene.sources > 1:
-        least = min(least, peak(scene.sources))
-    fitting = [batch for batch in range(1, scene.sources + 1) if peak(batch) <= budget]
-    if not fitting:
-        return Foreseen(least, least, 1, slabs)
-    # batches of equal size
-    batch = math.ceil(scene.sources / math.ceil(scene.sources / max(fitting)))
-    return Foreseen(peak(batch), min(least, peak(batch)), batch)
+    # all at once; their steps in slabs; batches of equal size; single sources, whose steps are in slabs if need be
+    everything = scene.sources
+    ways = [(everything, False), (everything, True)]
+    ways += [(math.ceil(everything / n), False) for n in range(2, everything + 1)]
+    ways.append((1, True))
+    peaks = {
+        (batch, slabs): peak(batch, slabs=slabs) for batch, slabs in dict.fromkeys(ways) if scene.crosses or not slabs
+    }
+    least = min(peaks.values())
+    return next(
+        Foreseen(held, least, batch, slabs) for (batch, slabs), held in peaks.items() if held <= max(budget, least)
+    )

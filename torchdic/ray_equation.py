@@ -12,6 +12,7 @@ No slope depends on the last three, the sums along the ray.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -45,6 +46,10 @@ class RayEquation:
         kappa = () if self.absorption is None else self.absorption.slices
         return (self.straight, self.background, *self.index.slices, *kappa)
 
+    @cached_property
+    def _unperturbed(self) -> "_Unperturbed":
+        return _Unperturbed(self.straight[:2], self.straight[2:4], self.straight[4:6], self.straight[6])
+
     def start(self) -> Float[Tensor, "component *ray"]:
         """The state on the first face."""
         components = MOVING + 1 + (self.absorption is not None) + self.turn
@@ -60,21 +65,23 @@ class RayEquation:
         self, moving: Float[Tensor, "4 *ray"], index: Float[Tensor, "3 *ray"], kappa: Float[Tensor, " *ray"] | None
     ) -> "Met":
         """As `meet`, of what was sampled before."""
-        delta, dp, pz0 = index[0], moving[2:], self.straight[6]
+        _, _, p0, pz0 = self._unperturbed
+        delta, dp = index[0], moving[2:]
+        dp_y, dp_x = dp.unbind()
         path = (delta + 2 * self.background).mul_(delta)
-        rise = torch.add(dp, self.straight[4:6], alpha=2).mul_(dp)
-        rise = torch.sub(path, rise[0], out=rise[0]).sub_(rise[1])
+        rise, other = torch.add(dp, p0, alpha=2).mul_(dp).unbind()
+        torch.sub(path, rise, out=rise).sub_(other)
         pz = torch.addcmul(rise, pz0, pz0).sqrt_()
         q = rise.div_(pz + pz0)
-        path.addcmul_(dp[0], dp[0]).addcmul_(dp[1], dp[1]).addcmul_(q, q)
-        return Met(moving, index, kappa, delta + self.background, pz, pz.reciprocal(), q, path)
+        path.addcmul_(dp_y, dp_y).addcmul_(dp_x, dp_x).addcmul_(q, q)
+        return Met(moving, dp, index, kappa, delta + self.background, pz, pz.reciprocal(), q, path)
 
     def moves(self, met: "Met") -> Float[Tensor, "4 *ray"]:
         """The slopes of δy, δx, δp_y and δp_x."""
         slopes = torch.empty_like(met.moving)
-        torch.addcmul(met.moving[2:], self.straight[2:4], met.q, value=-1, out=slopes[:2])
-        slopes[:2].mul_(met.r)
-        torch.mul(met.sampled[1:], met.n * met.r, out=slopes[2:])
+        of_place, of_momentum = slopes.split(2)
+        torch.addcmul(met.dp, self._unperturbed.v, met.q, value=-1, out=of_place).mul_(met.r)
+        torch.mul(met.sampled[1:], met.n * met.r, out=of_momentum)
         return slopes
 
     def slopes(self, met: "Met") -> Float[Tensor, "component *ray"]:
@@ -91,18 +98,20 @@ class RayEquation:
 
         A name that ends in _bar is the loss's derivative in that value.
         """
-        (_, gy, gx), n, pz, r, q = met.sampled, met.n, met.pz, met.r, met.q
-        dp, v = met.moving[2:], self.straight[2:4]
+        _, gy, gx = met.sampled.unbind()
+        n, pz, r, q, dp, (_, v, p0, _) = met.n, met.pz, met.r, met.q, met.dp, self._unperturbed
         learned = self.straight.requires_grad
 
         out = moves_bar * r
+        place_out, momentum_out = out.split(2)
         path_bar = torch.mul(sums_bar[0], r).mul_(h)
         index_bar = torch.empty_like(met.sampled)
-        n_bar = torch.mul(gy, out[2], out=index_bar[0]).addcmul_(gx, out[3])
-        gradient_bar = torch.mul(n, out[2:], out=index_bar[1:])
+        n_bar = torch.mul(gy, momentum_out[0], out=index_bar[0]).addcmul_(gx, momentum_out[1])
+        gradient_bar = torch.mul(n, momentum_out, out=index_bar[1:])
         # of r, by itself and within p_z: −r² of its own
-        r_bar = (n * n_bar).addcmul_(met.path, path_bar, value=0.5).addcmul_(dp[0], out[0]).addcmul_(dp[1], out[1])
-        drift = (v[0] * out[0]).addcmul_(v[1], out[1])
+        y_out, x_out = place_out.unbind()
+        r_bar = (n * n_bar).addcmul_(met.path, path_bar, value=0.5).addcmul_(dp[0], y_out).addcmul_(dp[1], x_out)
+        drift = (v[0] * y_out).addcmul_(v[1], x_out)
         r_bar.addcmul_(drift, q, value=-1)
         q_bar = torch.addcmul(drift, q, path_bar, value=-1).neg_()
         kappa_bar = None
@@ -112,7 +121,7 @@ class RayEquation:
             n_bar.addcmul_(met.kappa, kappa_out)
             r_bar.addcmul_(met.kappa, kappa_bar)
         pz_bar = q_bar.clone() if learned else q_bar
-        p, p_bar = dp + self.straight[4:6], None
+        p, p_bar = dp + p0, None
         if self.turn:
             turn_bar = torch.mul(sums_bar[-1], r).mul_(h).div_(n + pz)
             swept = self._swept(met).mul_(turn_bar)
@@ -134,24 +143,35 @@ class RayEquation:
             place_bar.add_(further)
             planes_bar.append(kappa_plane_bar)
         moving_bar = torch.empty_like(met.moving)
-        moving_bar[:2] = place_bar
-        torch.addcmul(p_bar, dp, path_bar, out=moving_bar[2:]).add_(out[:2])
+        of_place, of_momentum = moving_bar.split(2)
+        of_place.copy_(place_bar)
+        torch.addcmul(p_bar, dp, path_bar, out=of_momentum).add_(place_out)
         straight_bar = background_bar = None
         if learned:
-            v_bar = torch.mul(place_bar, z - self.face).addcmul_(out[:2], q, value=-1)
+            v_bar = torch.mul(place_bar, z - self.face).addcmul_(place_out, q, value=-1)
             straight_bar = torch.cat((place_bar, v_bar, p_bar, -q_bar[None]))
         if self.background.requires_grad:
             background_bar = n_bar.sum() - self.background * path_bar.sum()
         return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
 
     def _positions(self, z: float, moving: Tensor) -> tuple[Tensor, Tensor]:
-        y, x = torch.add(self.straight[:2], self.straight[2:4], alpha=z - self.face).add_(moving[:2])
+        place, v, _, _ = self._unperturbed
+        y, x = torch.add(place, v, alpha=z - self.face).add_(moving[:2]).unbind()
         return y, x
 
     def _swept(self, met: "Met") -> Tensor:
         """τ' p_z."""
-        p = met.moving[2:] + self.straight[4:6]
+        p = met.dp + self._unperturbed.p
         return (p[1] * met.sampled[1]).addcmul_(p[0], met.sampled[2], value=-1).div_(met.n + met.pz)
+
+
+class _Unperturbed(NamedTuple):
+    """The straight rays' (y, x) on the first face, (v_y, v_x), (p_y, p_x) and p_z."""
+
+    place: Tensor
+    v: Tensor
+    p: Tensor
+    pz: Tensor
 
 
 class Met(NamedTuple):
@@ -159,6 +179,8 @@ class Met(NamedTuple):
 
     # δy, δx, δp_y, δp_x
     moving: Tensor
+    # δp_y, δp_x
+    dp: Tensor
     # Δn, ∂n/∂y, ∂n/∂x
     sampled: Tensor
     kappa: Tensor | None

@@ -7,6 +7,7 @@ f_s = p0/λ. So the envelope of an unperturbed plane wave is 1.
 import math
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import axial_momentum
-from torchdic.recompute import Demand, recompute, slabs
+from torchdic.recompute import Demand, replay, slabs
 from torchdic.volume import Volume
 
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
@@ -153,38 +154,26 @@ def split_step(
         volume.background,
         axial_momentum(volume.background, momentum)[:, None, None],
     )
-    deltas = volume.delta.unbind(0)
-    kappas = None if volume.absorption is None else volume.absorption.unbind(0)
+    slices = [*volume.delta.unbind(0), *(() if volume.absorption is None else volume.absorption.unbind(0))]
+    count = len(volume.delta)
 
     difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
     H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
     # −1 takes out what a screen scatters into evanescent waves, before the next half of it can scatter that back
     excess = torch.where(pz > 0, pz0 / pz.clamp_min(LOWEST_PZ) - 1, -1)
 
-    def screen(step: int) -> Tensor:
-        n = n0 + slab_mean(deltas, step, steps)
-        path = (n - n0) * (n + n0)
-        if kappas is not None:
-            kappa = slab_mean(kappas, step, steps)
-            path = torch.complex(path - kappa**2, 2 * n * kappa)
-        return k0 * dz * path / (_root(pz0.square() + path) + pz0)
+    advance = _first_order if fidelity.order == 1 else _second_order
 
-    def first_order(phi: Tensor, S: Tensor) -> Tensor:
-        V = S * H
-        scattered = to_spectrum((exp_i(phi) - 1) * to_field(V))
-        return H * (V + (1 + excess) * scattered)
-
-    def second_order(phi: Tensor, S: Tensor) -> Tensor:
-        e = exp_i(phi / 2)
-        u = e * to_field(S * H)
-        a = to_field(excess * to_spectrum(1j * phi * u))
-        return H * to_spectrum(e * (u + a))
-
-    advance = first_order if fidelity.order == 1 else second_order
-
-    def cross(first: int, last: int, S: Tensor) -> Tensor:
+    def cross(
+        first: int, last: int, S: Tensor, H: Tensor, excess: Tensor, pz0: Tensor, n0: Tensor, *slices: Tensor
+    ) -> Tensor:
         for step in range(first, last):
-            S = advance(screen(step), S)
+            n = n0 + slab_mean(slices[:count], step, steps)
+            path = (n - n0) * (n + n0)
+            if len(slices) > count:
+                kappa = slab_mean(slices[count:], step, steps)
+                path = torch.complex(path - kappa**2, 2 * n * kappa)
+            S = advance(k0 * dz * path / (_root(pz0.square() + path) + pz0), S, H, excess)
         return S
 
     S = torch.zeros_like(H)
@@ -192,9 +181,22 @@ def split_step(
     kept = demand_of_wave(volume, momentum, fidelity).whole
     crowded = kept * pz.numel() * pz.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded):
-        S = recompute(cross, first, last, S, when=crowded)
+        S = replay(partial(cross, first, last), S, H, excess, pz0, n0, *slices, when=crowded)
     _check_energy(S.detach(), pz, volume, momentum, steps)
     return S
+
+
+def _first_order(phi: Tensor, S: Tensor, H: Tensor, excess: Tensor) -> Tensor:
+    V = S * H
+    scattered = to_spectrum((exp_i(phi) - 1) * to_field(V))
+    return H * (V + (1 + excess) * scattered)
+
+
+def _second_order(phi: Tensor, S: Tensor, H: Tensor, excess: Tensor) -> Tensor:
+    e = exp_i(phi / 2)
+    u = e * to_field(S * H)
+    a = to_field(excess * to_spectrum(1j * phi * u))
+    return H * to_spectrum(e * (u + a))
 
 
 @torch.no_grad()
@@ -240,11 +242,10 @@ def demand_of_wave(volume: Volume, momentum: Tensor, fidelity: Fidelity) -> Dema
         kept + 9 * medium,
         working,
         steps,
-        step + 2 * absorbs + 6 * medium,
+        step + 5 * absorbs + 6 * medium,
         working,
         carried=2,
         shared=3 + 3 * absorbs,
-        captured=3,
     )
 
 
