@@ -56,7 +56,7 @@ from torchdic import (
 from torchdic.fidelity import Propagation
 from torchdic.files import write_json, write_text
 from torchdic.landing import SidewaysError
-from torchdic.memory import allotted
+from torchdic.memory import allotted, check_volume
 from torchdic.precision import converged_fidelities, ladder, trials
 from torchdic.rays import TurnedRaysError
 from torchdic.tiff import StackError, write_stack
@@ -77,7 +77,7 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, or 2 for bad input, 130 for an interruption."""
+    """Run a command; returns the exit code: 0, 2 for bad input, 1 for a fit that diverges, 130 for an interruption."""
     options = _parser().parse_args(arguments)
     warnings.showwarning = _show_each_once()
     for kind in (SamplingWarning, ToleranceWarning):
@@ -143,8 +143,7 @@ def _simulate(options: argparse.Namespace) -> None:
         images = exact_images(specimen, grid, microscope, acquisition, fidelity)
     else:
         with torch.no_grad():
-            delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-            volume = Volume(grid, delta, specimen.background)
+            volume = _volume(specimen, grid, options.device)
             if config.tolerance is None:  # else a fidelity has yet to be planned
                 allotted(volume, microscope, acquisition, fidelity)
             prepare_folder(options.out)
@@ -172,11 +171,10 @@ def _plan(options: argparse.Namespace) -> None:
     config = load(options.config)
     specimen = _specimen(config, str(options.config))
     tolerance = USUAL_TOLERANCE if config.tolerance is None else config.tolerance
+    volume = _volume(specimen, config.volume.grid, options.device)
     if options.out is not None:
         prepare_folder(options.out)
-    grid = config.volume.grid
-    delta = specimen.delta(grid, dtype=torch.float32, device=options.device)
-    planned = plan(Volume(grid, delta, specimen.background), config.microscope, config.acquisition, tolerance)
+    planned = plan(volume, config.microscope, config.acquisition, tolerance)
     print(planned.table())
     if options.out is not None:
         write_json(options.out / "plan.json", planned.as_dict())
@@ -205,11 +203,11 @@ def _work_precision(options: argparse.Namespace) -> None:
         reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
     if config.simulation.exact and not hasattr(specimen, "field"):
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
+    volume = _volume(specimen, grid, options.device)
     prepare_folder(options.out)
     exact = None
     if hasattr(specimen, "field"):
         exact = exact_images(specimen, grid, microscope, acquisition, reference["wave"]).to(options.device)
-    volume = Volume(grid, specimen.delta(grid, dtype=torch.float32, device=options.device), specimen.background)
     steps = trials(
         volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats
     )
@@ -219,6 +217,12 @@ def _work_precision(options: argparse.Namespace) -> None:
     figures.save(draw_fronts({str((config.specimen or {})["kind"]): found}), options.out / "work_precision.png")
     print(as_table(found))
     print(f"\n{options.out / 'work_precision.csv'}, .json and .png: {len(found)} candidates")
+
+
+def _volume(specimen: Any, grid: Grid, device: torch.device) -> Volume:
+    """A specimen's voxels, float32. Raises ShortOfMemoryError where they would have no room."""
+    check_volume(grid, 2, device)  # beside the index, what it is made of
+    return Volume(grid, specimen.delta(grid, dtype=torch.float32, device=device), specimen.background)
 
 
 def _specimen(config: Config, source: str) -> Any:

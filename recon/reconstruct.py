@@ -102,7 +102,8 @@ def reconstruct(
         config = replace(config, fidelity=fidelity)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
-    if isinstance(fidelity, Fidelity):
+    memory.check_volume(config.volume.grid, COPIES, device)
+    if isinstance(fidelity, Fidelity):  # else one has yet to be planned
         _check_room(config, fidelity, data)
     identity = _identity(config, measured)
     saved = out / CHECKPOINT

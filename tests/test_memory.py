@@ -130,6 +130,51 @@ def test_without_a_gradient_batches_stay_in_the_caches_and_images_are_the_same(s
     assert foreseen(specimen(torch.float64, learned=True), SCOPE, ACQUISITION, fidelity).sources == 5
 
 
+@pytest.mark.parametrize("propagation", ["projection", "rays", "wave"])
+def test_nothing_is_kept_where_nothing_is_learned(specimen, propagation):
+    """With gradients enabled, as they are unless someone says otherwise."""
+    volume, fidelity = specimen(), Fidelity(propagation)
+    _, held = peak_bytes(lambda: image(volume, SCOPE, ACQUISITION, fidelity))
+    assert foreseen(volume, SCOPE, ACQUISITION, fidelity).peak / held == pytest.approx(1, abs=0.3)
+
+
+def test_a_learned_background_of_a_field_is_foreseen(monkeypatch):
+    """Room for half of what its gradient holds: sources in batches bring it down."""
+    transmission = torch.polar(torch.ones(40, 48), 0.1 * torch.rand(40, 48))
+    grid = Grid((1, 40, 48), (1.0, 0.2, 0.21))
+    background = torch.tensor(N0, requires_grad=True)
+
+    def run(memory):
+        def gradient():
+            fidelity = Fidelity(memory=memory)
+            image_field(transmission, grid, SCOPE, MANY, background=background, fidelity=fidelity).sum().backward()
+
+        return peak_bytes(gradient)[1]
+
+    whole = run(AMPLE)
+    assert run(whole * 6 // 10) < 0.8 * whole
+
+
+def test_steps_that_an_adaptive_solver_ignores_change_no_estimate(specimen):
+    few, many = (
+        foreseen(specimen(learned=True), SCOPE, ACQUISITION, Fidelity("rays", solver="dopri5", steps=steps))
+        for steps in (None, 100)
+    )
+    assert few == many
+
+
+def test_the_least_is_what_is_held_at_the_smallest_budget():
+    """Two sources in a deep volume: a second copy of its gradient is more than a second source."""
+    grid = Grid((64, 40, 40), (0.2, 0.2, 0.2))
+    volume = Volume(grid, torch.zeros(grid.shape, requires_grad=True), N0)
+    scope = replace(SCOPE, condenser=Condenser(0.4, POINTS[:2]))
+    fidelity = Fidelity("wave", order=1, steps=1, memory=1)
+    found = foreseen(volume, scope, ACQUISITION, fidelity)
+    assert found.peak == found.least
+    held = measured(volume, scope, ACQUISITION, fidelity, gradient=True)
+    assert found.peak / held == pytest.approx(1, abs=0.3)
+
+
 def test_a_smaller_budget_makes_slabs_then_smaller_batches_then_both(specimen):
     volume, fidelity = specimen(learned=True), Fidelity("wave")
     whole = foreseen(volume, SCOPE, ACQUISITION, fidelity)

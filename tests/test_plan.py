@@ -1,6 +1,7 @@
 import json
 import math
 import tomllib
+import warnings
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -438,6 +439,44 @@ def test_directions_are_counted_as_the_microscope_makes_them(condenser, sources)
     microscope = replace(MICROSCOPE, condenser=condenser)
     made, _ = microscope.sources(Fidelity(sources=sources), dtype=torch.float32, device=torch.device("cpu"))
     assert directions(microscope, sources) == len(made)
+
+
+def test_a_camera_does_not_keep_a_strong_specimen_from_being_planned():
+    grid = Grid((4, 32, 32), (1.0, 0.2, 0.2))
+    microscope = replace(MICROSCOPE, camera=Camera(pixel_size=0.4))
+    bead = gaussian(0.25, 1.0, grid)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ToleranceWarning)
+        made = plan(bead, microscope, ACQUISITION, 0.2)
+    assert math.isfinite(made.error)
+    assert all(math.isfinite(e.error) for e in made.effects)
+
+
+def test_a_pixel_wider_than_the_rays_window_leaves_their_estimates():
+    microscope = replace(MICROSCOPE, camera=Camera(pixel_size=7.0))
+    ball = gaussian(0.03, 1.2, Grid((10, 80, 80), (0.4, 0.2, 0.2)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ToleranceWarning)
+        effects = by_name(plan(ball, microscope, ACQUISITION, 1e-4))
+    assert effects["bending"].basis == effects["diffraction"].basis == "pilot"
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.ToleranceWarning", "ignore::torchdic.SamplingWarning")
+def test_light_that_straight_rays_cannot_carry_is_planned_for_the_wave():
+    """An index below the light's transverse momentum, where absorption lets the wave through."""
+    grid = Grid((8, 16, 16), (0.05, 0.2, 0.2))
+    delta = torch.full(grid.shape, -0.67)
+    layer = volume(delta, grid, absorption=torch.full(grid.shape, 0.01))
+    made = plan(layer, Microscope(0.546, Objective(0.9), Condenser(0.75)), Acquisition([None]), 0.2)
+    assert made.fidelity.propagation == "wave"
+    assert by_name(made)["bending"].needed
+
+
+def test_shears_may_be_whole_numbers_and_specimens_one_voxel_wide():
+    ball = GaussianBall(0.6, 0.02, 1.36).delta(Grid((8, 40, 40), (0.4, 0.2, 0.2)))
+    thin = volume(ball[:, 20:21], Grid((8, 1, 40), (0.4, 0.2, 0.2)))
+    far = Acquisition([Prism((0, 1), 1)], [6.0])
+    assert plan(thin, MICROSCOPE, far, 0.1).fidelity.padding > 0
 
 
 # its manners

@@ -12,7 +12,9 @@ from torchdic.grid import Grid
 from torchdic.image_error import relative
 from torchdic.instrument import Acquisition
 from torchdic.ladders import Choice, Side
+from torchdic.landing import SidewaysError
 from torchdic.pilots import MOST_UNSTABLE, Scene
+from torchdic.rays import TurnedRaysError
 from torchdic.volume import Volume
 from torchdic.wave import UnstableError
 
@@ -96,7 +98,11 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
         found.append(_absent("sides"))
 
     def without(name: str, less: Scene, full: Scene) -> Effect:
-        return effect(name, relative(less(coarse) - base, base), "left out", saved(fidelity, full))
+        try:
+            images = less(coarse)
+        except UnstableError:
+            return effect(name, 1.0, "left out, light can't go on", saved(fidelity, full), basis="bound")
+        return effect(name, relative(images - base, base), "left out", saved(fidelity, full))
 
     microscope, volume = scene.microscope, scene.volume
     if microscope.polarisation is None:
@@ -158,13 +164,17 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
     """What each rung between straight rays and waves adds; bounds where projection is good enough or rays fail."""
     names = "bending", "amplitude", "diffraction", "object aberration"
     note = "all that projection lacks"
-    projection, finest = climbed.ways[0], climbed.ways[1]
+    finest = next(way for way in climbed.ways if way.fidelity.propagation == "wave")
+    projection = next((way for way in climbed.ways if way.fidelity.propagation == "projection"), None)
+    if projection is None:
+        return [effect(name, 1.0, "light along straight rays can't go on toward +z", basis="bound") for name in names]
     straight = relative(projection.lacks, climbed.truth)
     if straight <= tolerance / 2:
         return [effect(name, straight, note, basis="bound") for name in names]
     acquisition = climbed.pilot.acquisition
     ends = [acquisition.focus[0], acquisition.focus[-1]]
-    small = replace(climbed.pilot, acquisition=Acquisition(acquisition.prisms[:1], ends))
+    # a camera's pixels may not fit into so small a window
+    small = _changed(replace(climbed.pilot, acquisition=Acquisition(acquisition.prisms[:1], ends)), camera=None)
     small = small.window(RAY_WINDOW).lit(RAY_SOURCES)
     steps = min(small.slices, RAY_STEPS)
     rays = Fidelity("rays", steps=steps)
@@ -173,9 +183,8 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
         projected = small(Fidelity("projection"))
         bent = small(replace(rays, amplitude=False))
         carried = small(rays)
-    except ValueError as error:  # light that can't go on, or leaves sideways
-        why = str(error).splitlines()[0]
-        return [effect(name, straight, f"{note}; {why}", basis="bound") for name in names]
+    except (TurnedRaysError, SidewaysError, UnstableError) as error:
+        return [effect(name, straight, f"{note}; {error}", basis="bound") for name in names]
     found = [
         effect("bending", relative(bent - projected, wave), "bent rays against straight ones"),
         effect("amplitude", relative(carried - bent, wave), "rays with and without it"),
@@ -183,7 +192,7 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
     ]
     try:
         own = small(Fidelity("projection", object_aberration="linear", steps=steps))
-    except ValueError:
-        return [*found, effect(names[-1], straight, f"{note}; the specimen is too strong a lens", basis="bound")]
+    except ValueError as error:  # too strong a lens
+        return [*found, effect(names[-1], straight, f"{note}; {error}", basis="bound")]
     seen = "in straight rays; the wave has it already"
     return [*found, effect(names[-1], relative(own - projected, wave), seen)]

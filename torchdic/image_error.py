@@ -15,7 +15,7 @@ def image_error(images: Float[Tensor, "prism focus y x"], truth: Float[Tensor, "
     return relative(images.to(truth) - truth, truth)
 
 
-def relative(difference: Float[Tensor, "prism focus y x"], truth: Float[Tensor, "prism focus y x"]) -> float:
+def relative(difference: Float[Tensor, "prism focus #y #x"], truth: Float[Tensor, "prism focus y x"]) -> float:
     """The same of a difference."""
     contrast = truth.std((2, 3), correction=0).clamp_min(FLOOR)
     return float((difference.square().mean((2, 3)).sqrt() / contrast).max())

@@ -3,6 +3,7 @@
 What a choice lacks is an image, not a number, because the errors of two choices may cancel or add up.
 """
 
+import contextlib
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from torchdic.cost import SLAB
 from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
 from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
+from torchdic.rays import TurnedRaysError
 from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
@@ -115,7 +117,9 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
         ladder.append(2 * ladder[-1])
     truth = finest + (finest - middle) / (ratio - 1)
 
-    ways = [Choice(Fidelity("projection"), pilot(Fidelity("projection")) - truth)]
+    ways: list[Choice] = []
+    with contextlib.suppress(TurnedRaysError):  # where straight rays can't go on, waves may
+        ways.append(Choice(Fidelity("projection"), pilot(Fidelity("projection")) - truth))
     orders: tuple[Literal[1, 2], ...] = 2, 1
     dearest = math.inf  # beyond this work the second order serves better
     for order in orders:
@@ -184,8 +188,9 @@ def needed_padding(scene: Scene) -> int:
     for axis in range(3):
         filled = there.any(dim=tuple(a for a in range(3) if a != axis)).nonzero()
         spans.append((int(filled[0]), int(filled[-1])))
-    gaps = [min(low, grid.shape[a] - 1 - high) * grid.spacing[a] for a, (low, high) in enumerate(spans) if a > 0]
-    if min(gaps) == 0:
+    # across one voxel there is nowhere to go
+    gaps = {a: min(spans[a][0], grid.shape[a] - 1 - spans[a][1]) for a in (1, 2) if grid.shape[a] > 1}
+    if not gaps or min(gaps.values()) == 0:
         return 0
     depths = [grid.centre(0, i) for i in spans[0]]
     distance = max(abs(float(torch.as_tensor(z)) - d) for z, d in itertools.product(acquisition.focus, depths))
@@ -193,5 +198,5 @@ def needed_padding(scene: Scene) -> int:
     sine = min((n0 if microscope.objective is None else microscope.objective.na) / n0, 0.95)
     shear = max((float(torch.as_tensor(p.shear).abs().max()) for p in acquisition.prisms if p is not None), default=0.0)
     reach = distance * sine / math.sqrt(1 - sine**2) + shear + BLUR * microscope.wavelength / (n0 * sine)
-    beyond = max((reach - gap) / grid.spacing[a + 1] for a, gap in enumerate(gaps))
+    beyond = max(reach / grid.spacing[a] - gap for a, gap in gaps.items())
     return min(max(0, math.ceil(beyond / 2)), max(grid.shape[1:]) // 2)

@@ -13,9 +13,9 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.caustics import tubes_that_may_fold
-from torchdic.fidelity import ADAPTIVE, Fidelity
+from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, kept_by_rays, launch
+from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, kept_by_rays, launch, steps_of
 from torchdic.recompute import Demand, indices
 from torchdic.volume import Volume
 
@@ -119,7 +119,7 @@ def demand_of_rays(volume: Volume, fidelity: Fidelity, *, turned: bool = False) 
     area = (ny + 2 * fidelity.padding) * (nx + 2 * fidelity.padding)
     sides = 2 * (fidelity.padding + MARGIN)
     rays = (ny + sides) * (nx + sides) / area
-    steps = (None if fidelity.solver in ADAPTIVE else fidelity.steps) or volume.grid.shape[0]
+    steps = steps_of(volume.grid, fidelity)
     step = kept_by_rays(volume.grid, fidelity, absorbs=absorbs) / steps
     cubic = fidelity.interpolation == "cubic"
     back = 190 + 20 * index if cubic else 60

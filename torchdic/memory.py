@@ -100,6 +100,7 @@ def allotted(
 def allotted_to_fields(
     transmission: Tensor,
     grid: Grid,
+    background: Tensor,
     sources: int,
     microscope: Microscope,
     acquisition: Acquisition,
@@ -109,7 +110,7 @@ def allotted_to_fields(
     free = free_bytes(transmission.device)
     wanted = torch.is_grad_enabled()
     own = wanted and transmission.requires_grad
-    setting = wanted and learned((microscope, acquisition))
+    setting = wanted and learned((background, microscope, acquisition))
     # padded, and its spectrum; a gradient of each
     aside = (2 + 2 * own) * 2 * (sources if transmission.ndim == 3 else 1)
     imaging = demand_of_imaging(grid, microscope, acquisition, learned=setting)
@@ -137,6 +138,12 @@ def check_room(wanted: int, free: int | None, what: str) -> None:
             f"{what} want at least {wanted / GIB:.3g} GiB of memory, {free / GIB:.3g} GiB are free; fewer voxels, "
             "prism settings, focus planes or steps, less padding or another propagation want less"
         )
+
+
+def check_volume(grid: Grid, copies: int, device: torch.device) -> None:
+    """Raise ShortOfMemoryError where so many float32 arrays of a grid, not made yet, would have no room."""
+    wanted = copies * math.prod(grid.shape) * torch.float32.itemsize
+    check_room(wanted, free_bytes(device), f"{copies} arrays of {'×'.join(map(str, grid.shape))} voxels")
 
 
 def free_bytes(device: torch.device) -> int | None:

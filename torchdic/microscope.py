@@ -152,7 +152,7 @@ def image_field(
     n0 = torch.as_tensor(background, dtype=real.dtype, device=real.device)
     pad = fidelity.padding
     grid = grid.widened(pad, pad)
-    plan = allotted_to_fields(transmission, grid, len(weights), microscope, acquisition, fidelity)
+    plan = allotted_to_fields(transmission, grid, n0, len(weights), microscope, acquisition, fidelity)
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:

@@ -50,9 +50,8 @@ class Scene:
         return self.volume.grid.shape[0]
 
     def nothing(self) -> Tensor:
-        """Images of nan, for what can't be computed."""
-        _, ny, nx = self.volume.grid.shape
-        return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), ny, nx), math.nan)
+        """Images of nan, for what can't be computed; a pixel each, as wide as any others beside them."""
+        return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), 1, 1), math.nan)
 
     def coarse(self) -> Iterator[Fidelity]:
         """Fidelities for what has nothing to do with slabs, from the cheapest on: a strong specimen asks for a finer.
@@ -76,7 +75,7 @@ class Scene:
         """
         prisms = self.acquisition.prisms
         levels = [1.0 if p is None else math.sin(float(torch.as_tensor(p.bias)) / 2) ** 2 for p in prisms]
-        shears = [0.0 if p is None else float(torch.as_tensor(p.shear).norm()) for p in prisms]
+        shears = [0.0 if p is None else float(torch.as_tensor(p.shear, dtype=torch.float64).norm()) for p in prisms]
         picked = {levels.index(min(levels)), levels.index(max(levels)), shears.index(max(shears)), len(prisms) - 1}
         depths = [float(torch.as_tensor(z)) for z in self.acquisition.focus]
         plane = self.volume.mean_plane()
@@ -142,7 +141,9 @@ class Scene:
         for axis in (1, 2):
             if shape[axis] > 1:
                 busy = busy + torch.gradient(strength, dim=axis)[0].square()
-        sums = F.avg_pool2d(busy.sum(0)[None, None], size, stride=1)[0, 0]
+        # one axis after the other: a square window costs its area at each place
+        rows = F.avg_pool2d(busy.sum(0)[None, None], (size[0], 1), stride=1)
+        sums = F.avg_pool2d(rows, (1, size[1]), stride=1)[0, 0]
         row, column = divmod(int(sums.argmax()), sums.shape[1])
         fade = _fade(size, shape[1:]).to(strength)
 

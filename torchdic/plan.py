@@ -172,7 +172,8 @@ def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) ->
     for choice in (*meeting, *sorted(tried, key=lambda choice: choice[1])):
         if not strained or pilot.carries(choice[0]):
             return choice
-    raise UnstableError(f"no number of slabs up to {climbed.ways[1].fidelity.steps} carries the light of all sources")
+    most = max(way.fidelity.steps or 0 for way in climbed.ways)
+    raise UnstableError(f"no number of slabs up to {most} carries the light of all sources")
 
 
 def _detached(volume: Volume) -> Volume:

@@ -42,7 +42,7 @@ def solve(
     toward +z ends as nan.
     """
     if fidelity.solver not in ADAPTIVE:
-        keep = torch.is_grad_enabled()
+        keep = torch.is_grad_enabled() and any(t.requires_grad for t in (state, *equation.tensors))
         return _EqualSteps.apply(equation, depths, fidelity.solver, keep, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
     def slopes(z: Tensor, state: Tensor) -> Tensor:

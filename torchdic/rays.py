@@ -163,7 +163,7 @@ def deviation(
 
     state = straight.new_zeros(4 + len(fields) + turn, *straight.shape[1:])
     equal_steps = fidelity.solver not in ADAPTIVE
-    steps = (fidelity.steps if equal_steps else None) or grid.shape[0]
+    steps = steps_of(grid, fidelity)
     # kept on the CPU: a depth read from another device would make every stage wait for it
     depths = face + grid.extent[0] * torch.arange(steps + 1, dtype=state.dtype) / steps
     depths[-1] = -face
@@ -179,8 +179,13 @@ def deviation(
     return Deviation(position, momentum, state[4], absorbed, state[-1] if turn else None)
 
 
+def steps_of(grid: Grid, fidelity: Fidelity) -> int:
+    """Equal steps through the volume, or the stretches after each of which an adaptive solver is looked at."""
+    return (None if fidelity.solver in ADAPTIVE else fidelity.steps) or grid.shape[0]
+
+
 def kept_by_rays(grid: Grid, fidelity: Fidelity, *, absorbs: bool = False) -> int:
     """Values per ray that the backward pass keeps: where each step began, and what its evaluations sampled."""
     # an adaptive solver keeps a state for each, and how many there are is known afterwards
     evaluations = len(TABLEAUX[fidelity.solver][1]) if fidelity.solver in TABLEAUX else 6
-    return (4 + (3 + absorbs) * evaluations) * (fidelity.steps or grid.shape[0])
+    return (4 + (3 + absorbs) * evaluations) * steps_of(grid, fidelity)
