@@ -420,6 +420,7 @@ CASES = [
     Case(
         "aberrations of 0",
         lambda: Scene(smooth(0.02), values=value(**{f"aberration_{i}": 0.0 for i in range(1, 12)})),
+        gradient_rounding=8192,  # of the piston, whose terms, some hundreds, add up to 0
     ),
     Case(
         "strain of 0",

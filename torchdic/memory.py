@@ -30,8 +30,8 @@ from torchdic.volume import Volume
 from torchdic.wave import demand_of_wave
 
 GIB = 1 << 30
-# Bytes that a batch of fields on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches,
-# up to 1.4 times as fast (192² pixels, 50 sources). Rays, at work on one mesh after the other, gain nothing.
+# Bytes that a batch on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches, up to 1.4
+# times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
 
 
@@ -115,11 +115,14 @@ def allotted_to_fields(
     aside = (2 + 2 * own) * 2 * (sources if transmission.ndim == 3 else 1)
     imaging = demand_of_imaging(grid, microscope, acquisition, learned=setting)
     images = len(acquisition.prisms) * len(acquisition.focus)
-    nothing = Demand(0, 0, 0)
-    scene = _Scene(nothing, imaging, 1, sources, 1, aside, 0, 0, images, own or setting, False)
+    scene = _Scene(
+        crossing=Demand(0, 0, 0), imaging=imaging, sources=sources, aside=aside, images=images, learned=own or setting
+    )
     _, ny, nx = grid.shape
-    each = ny * nx * transmission.real.element_size()
-    found = _fitted(scene, each, fidelity.memory if free is None else max(1, min(fidelity.memory, free)))
+    budget = fidelity.memory if free is None else max(1, min(fidelity.memory, free))
+    if not scene.learned and transmission.device.type == "cpu":
+        budget = min(budget, CACHED)
+    found = _fitted(scene, ny * nx * transmission.real.element_size(), budget)
     check_room(found.least, free, f"{len(acquisition.prisms)} × {len(acquisition.focus)} images of {ny}×{nx} pixels")
     return found
 
@@ -229,20 +232,21 @@ class _Scene:
 
     aside: beside the batches. before: at most, before or after them. slices: of each field whose gradient is wanted.
     images: prisms × focus planes. learned: whether a gradient is wanted at all, crosses: whether one goes through the
-    specimen.
+    specimen. bent: whether rays do.
     """
 
     crossing: Demand
     imaging: Demand
-    components: int
     sources: int
-    colours: int
-    aside: float
-    before: float
-    slices: int
     images: int
     learned: bool
-    crosses: bool
+    crosses: bool = False
+    bent: bool = False
+    components: int = 1
+    colours: int = 1
+    slices: int = 0
+    aside: float = 0
+    before: float = 0
 
     def values(self, batch: int, *, slabs: bool) -> float:
         """Values per pixel held at most, in batches of so many sources."""
@@ -296,7 +300,7 @@ def _scene(
         wanted = torch.is_grad_enabled()
         crosses = wanted and any(part is not None and part.requires_grad for part in parts)
     else:
-        wanted, crosses, own = gradient, gradient, own or gradient
+        wanted, crosses, own = gradient, gradient, max(own, int(gradient))
     turned = microscope.turns and fidelity.propagation == "rays"
     components = 2 if turned else 1
     if fidelity.propagation == "projection":
@@ -341,17 +345,18 @@ def _scene(
     images, colours = len(acquisition.prisms) * len(acquisition.focus), len(microscope.colours())
     aside += (colours - 1) * images * math.prod(volume.grid.shape[1:]) / pixels
     return _Scene(
-        crossing,
-        imaging,
-        components,
-        len(momentum),
-        colours,
-        aside,
-        before,
-        own * slices,
-        images,
-        crosses or (wanted and setting),
-        crosses,
+        crossing=crossing,
+        imaging=imaging,
+        sources=len(momentum),
+        images=images,
+        learned=crosses or (wanted and setting),
+        crosses=crosses,
+        bent=fidelity.propagation == "rays",
+        components=components,
+        colours=colours,
+        slices=own * slices,
+        aside=aside,
+        before=before,
     )
 
 
@@ -367,7 +372,7 @@ def _foreseen(
     scene = _scene(volume, microscope, acquisition, fidelity, momentum, levels, gradient)
     _, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
     budget = fidelity.memory
-    if not scene.learned and fidelity.propagation != "rays" and volume.delta.device.type == "cpu":
+    if not scene.learned and volume.delta.device.type == "cpu":
         budget = min(budget, CACHED)
     return _fitted(scene, ny * nx * volume.delta.element_size(), budget)
 
@@ -378,9 +383,10 @@ def _fitted(scene: _Scene, each: int, budget: int) -> Foreseen:
     def peak(batch: int, *, slabs: bool = False) -> int:
         return math.ceil(scene.values(batch, slabs=slabs) * each)
 
-    # all at once; their steps in slabs; batches of equal size; single sources, whose steps are in slabs if need be
+    # all at once; their steps in slabs (not of rays, faster in small batches); batches of equal size; single sources,
+    # whose steps are in slabs if need be
     everything = scene.sources
-    ways = [(everything, False), (everything, True)]
+    ways = [(everything, False)] + ([] if scene.bent else [(everything, True)])
     ways += [(math.ceil(everything / n), False) for n in range(2, everything + 1)]
     ways.append((1, True))
     peaks = {
