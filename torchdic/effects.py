@@ -22,6 +22,11 @@ from torchdic.wave import UnstableError
 RAY_WINDOW, RAY_SOURCES, RAY_STEPS = 32, 3, 8
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things: 1 slab, 2 slabs."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 @dataclass(frozen=True)
 class Effect:
     """An effect, and what it is worth.
@@ -76,16 +81,16 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
 
     K = fidelity.sources
     if len(counts) == 1 and counts[0].fidelity.sources == K:
-        note = f"the condenser's own {K} direction{'s' if K > 1 else ''}"
+        note = f"the condenser's own {counted(K, 'direction')}"
         found.append(Effect("partial coherence", K > 1, 0.0, 0.0, "absent", note))
     else:
         fewest = counts[0].fidelity.sources
-        note = f"{fewest} source in place of {K}"
+        note = f"{counted(fewest, 'source')} in place of {K}"
         cost = saved(replace(fidelity, sources=fewest))
         found.append(effect("partial coherence", against_truth(counts[0].lacks), note, cost))
 
     steps, images = _fewest_slabs(pilot)
-    note = f"{steps} slab{'s' if steps > 1 else ''} in place of several" + ("; fewer make energy" if steps > 1 else "")
+    note = f"{counted(steps, 'slab')} in place of several" + ("; fewer make energy" if steps > 1 else "")
     lost = against_truth(images - pilot(replace(coarse, order=2)))
     found.append(effect("steps", lost, note, saved(replace(fidelity, steps=1))))
 

@@ -72,7 +72,8 @@ def form_image(
     k0 = 2 * math.pi / wavelength
 
     def sharp(focus: float | Tensor) -> Tensor:
-        depth = torch.as_tensor(focus, dtype=difference.dtype, device=difference.device)
+        # a number stays one: brought to another device, it would be waited for
+        depth = focus.to(difference) if isinstance(focus, Tensor) else focus
         wave = spectrum * exp_i(k0 * (depth - plane) * difference)
         return spread.cut(wave, focus) if band_limit else wave
 

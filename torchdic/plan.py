@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from torchdic.cost import directions, seconds, work
-from torchdic.effects import Climbed, Effect, effects
+from torchdic.effects import Climbed, Effect, counted, effects
 from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
 from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_apertures
@@ -79,9 +79,12 @@ def describe(fidelity: Fidelity) -> str:
     """A fidelity's choices in a line."""
     parts = [f'"{fidelity.propagation}"']
     if fidelity.propagation == "wave":
-        parts.append(f"{fidelity.steps or 'one a slice'} slabs of order {fidelity.order}")
-    sides = f", {fidelity.padding} voxels of padding" if fidelity.padding else ""
-    return ", ".join([*parts, f"{fidelity.sources} sources"]) + sides
+        slabs = "a slab a slice" if fidelity.steps is None else counted(fidelity.steps, "slab")
+        parts.append(f"{slabs} of order {fidelity.order}")
+    parts.append(counted(fidelity.sources, "source"))
+    if fidelity.padding:
+        parts.append(f"{counted(fidelity.padding, 'voxel')} of padding")
+    return ", ".join(parts)
 
 
 @torch.no_grad()

@@ -226,7 +226,7 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
         f"slabs of {thickness:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind them the wave has "
         f"{least:.3g} times the energy that came in, and nothing absorbs; use more than {steps} steps",
         SlabWarning,
-        stacklevel=2,
+        stacklevel=3,  # torch.no_grad is a call between
     )
 
 

@@ -113,5 +113,5 @@ def check_wrap_around(
         f"focus {farthest:g} µm lies {distance:g} µm from the specimen: {100 * part:.2g} % of the light "
         f"leaves the array and {fate}; {padding} more voxels of padding would hold it",
         WrapAroundWarning,
-        stacklevel=2,
+        stacklevel=3,  # torch.no_grad is a call between
     )
