@@ -382,19 +382,28 @@ def test_light_that_cannot_be_followed_is_one_line_and_exit_code_2(run, write, p
 # --- memory ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkeypatch):
-    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: 2000)
+@pytest.mark.parametrize(
+    ("free", "wanted"),
+    [(2000, "2 arrays of 4×14×12 voxels"), (10_000, "2 prism settings × 3 focus planes of 4×14×12 voxels")],
+)
+def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkeypatch, free, wanted):
+    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: free)
     line = refused("simulate", write())
-    assert "2 prism settings × 3 focus planes of 4×14×12 voxels" in line
+    assert wanted in line
     assert "GiB are free" in line
 
 
+@pytest.mark.parametrize(
+    ("free", "wanted"), [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")]
+)
 @pytest.mark.parametrize("start", ["linear", "zero"])
-def test_a_reconstruction_without_room_is_refused_before_it_begins(write, run, refused, monkeypatch, tmp_path, start):
+def test_a_reconstruction_without_room_is_refused_before_it_begins(
+    write, run, refused, monkeypatch, tmp_path, start, free, wanted
+):
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())
-    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: 2000)
+    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: free)
     line = refused("reconstruct", write({"reconstruction.start": start}))
-    assert "reconstruction of 4×14×12 voxels" in line
+    assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before

@@ -1,9 +1,11 @@
 """Memory bounded without a change of result."""
 
+import warnings
+
 import pytest
 import torch
 
-from torchdic.recompute import recompute, replay, slabs, sum_over_sources
+from torchdic.recompute import BatchWarning, recompute, replay, slabs, sum_over_sources
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 10, 17, 100])
@@ -85,3 +87,16 @@ def test_sum_over_sources_does_not_depend_on_the_batches(size):
     assert float(total.detach()) == pytest.approx(float((values.detach().square() * weights).sum()))
     total.backward()
     torch.testing.assert_close(values.grad, 2 * values.detach() * weights)
+
+
+def test_of_a_warning_about_each_batch_the_worst_is_given_and_others_pass():
+    def function(values):
+        warnings.warn(BatchWarning(f"of {values.tolist()}", severity=float(values.max())), stacklevel=1)
+        warnings.warn("another", RuntimeWarning, stacklevel=1)
+        return values.sum()
+
+    values = torch.tensor([1.0, 3.0, 2.0])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert float(sum_over_sources(function, (values,), 1)) == 6
+    assert [str(w.message) for w in caught] == ["another"] * 3 + ["of [3.0]"]

@@ -111,3 +111,20 @@ def test_light_that_is_cut_is_that_which_the_warning_names():
     assert part > UNREMARKED
     # named to two digits
     assert 1 - rest / whole == pytest.approx(part, rel=0.05)
+
+
+def test_an_image_in_batches_warns_once_and_its_gradient_not_again():
+    """Of the worst batch: the two sources' light spreads differently."""
+    volume = specimen()
+    volume = Volume(GRID, volume.delta.requires_grad_(), 1.36)
+    acquisition = Acquisition([None], [40.0])
+    parts = []
+    for batch in (1, 2):
+        with pytest.warns(WrapAroundWarning) as caught:
+            images = image(volume, MICROSCOPE, acquisition, Fidelity("rays", memory=1 if batch == 1 else 1 << 40))
+        assert len(caught) == 1
+        parts.append(float(re.search(r"([\d.]+) % of the light", str(caught[0].message))[1]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            images.sum().backward()
+    assert parts[0] >= parts[1]

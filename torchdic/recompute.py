@@ -1,7 +1,9 @@
 """Memory bounded: sources in batches, and intermediate values recomputed where there is no room to keep them."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -40,6 +42,17 @@ class Demand:
         return self.kept + self.steps * self.step
 
 
+class BatchWarning(UserWarning):
+    """A warning about a batch of sources, of which the worst of an image's batches speaks for all.
+
+    severity: the larger, the worse.
+    """
+
+    def __init__(self, message: str, severity: float = 0.0) -> None:
+        super().__init__(message)
+        self.severity = severity
+
+
 def indices(dtype: torch.dtype) -> float:
     """How many values of a dtype an index takes."""
     return torch.int64.itemsize / dtype.itemsize
@@ -49,7 +62,13 @@ def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
     """function(*arguments), whose intermediate values are computed again in the backward pass instead of kept."""
     if not (when and torch.is_grad_enabled()):
         return function(*arguments)
-    return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)  # pyright: ignore[reportReturnType]
+    return checkpoint(  # pyright: ignore[reportReturnType]
+        function,
+        *arguments,
+        use_reentrant=False,
+        preserve_rng_state=False,
+        context_fn=lambda: (nullcontext(), _quietly()),
+    )
 
 
 def replay(function: Callable[..., Tensor], *tensors: Tensor, when: bool) -> Tensor:
@@ -90,9 +109,39 @@ def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
 
 def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
     """Σ of function(batch of each tensor) over batches of `size` sources; several are computed again when needed."""
-    count = len(per_source[0])
+    if size >= len(per_source[0]):
+        return function(*per_source)
     batches = zip(*(t.split(size) for t in per_source), strict=True)
-    total = recompute(function, *next(batches), when=size < count)
-    for batch in batches:
-        total = total + recompute(function, *batch, when=size < count)
+    with _worst_of_each_kind():
+        total = recompute(function, *next(batches), when=True)
+        for batch in batches:
+            total = total + recompute(function, *batch, when=True)
     return total
+
+
+@contextmanager
+def _worst_of_each_kind() -> Iterator[None]:
+    """Of the BatchWarnings within, only the worst of each kind is given, at the end."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    worst: dict[type[Warning], warnings.WarningMessage] = {}
+    for one in caught:
+        message = one.message
+        if not isinstance(message, BatchWarning):
+            warnings.warn_explicit(message, one.category, one.filename, one.lineno)
+            continue
+        other = worst.setdefault(one.category, one).message
+        assert isinstance(other, BatchWarning)
+        if message.severity > other.severity:
+            worst[one.category] = one
+    for one in worst.values():
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """What is computed again has been warned about."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BatchWarning)
+        yield

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import axial_momentum
-from torchdic.recompute import Demand, replay, slabs
+from torchdic.recompute import BatchWarning, Demand, replay, slabs
 from torchdic.volume import Volume
 
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
@@ -36,7 +36,7 @@ class UnstableError(ValueError):
     """Light that slabs can't carry: one line with the energy they make and their number, or with the index's fall."""
 
 
-class SlabWarning(UserWarning):
+class SlabWarning(BatchWarning):
     """Slabs too thick for a specimen's contrast: they lose energy."""
 
 
@@ -223,9 +223,11 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
             f"them the wave has {most:.3g} times the energy that came in; use more than {steps} steps"
         )
     warnings.warn(
-        f"slabs of {thickness:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind them the wave has "
-        f"{least:.3g} times the energy that came in, and nothing absorbs; use more than {steps} steps",
-        SlabWarning,
+        SlabWarning(
+            f"slabs of {thickness:g} µm are too thick for Δn from {low:.3g} to {high:.3g}: behind them the wave has "
+            f"{least:.3g} times the energy that came in, and nothing absorbs; use more than {steps} steps",
+            severity=1 - least,
+        ),
         stacklevel=3,  # torch.no_grad is a call between
     )
 

@@ -16,12 +16,13 @@ from torch import Tensor
 
 from torchdic.grid import Grid
 from torchdic.instrument import Acquisition
+from torchdic.recompute import BatchWarning
 
 # Part of an image's light that may wrap around unremarked: its root is about what it changes an image by.
 UNREMARKED = 1e-4
 
 
-class WrapAroundWarning(UserWarning):
+class WrapAroundWarning(BatchWarning):
     """A focus so far from the specimen that its light leaves the array, to wrap around or to be cut."""
 
 
@@ -110,8 +111,10 @@ def check_wrap_around(
     padding = math.ceil(float(beyond[order][kept].amax()))
     fate = "is cut" if cut else "comes back in at the opposite side"
     warnings.warn(
-        f"focus {farthest:g} µm lies {distance:g} µm from the specimen: {100 * part:.2g} % of the light "
-        f"leaves the array and {fate}; {padding} more voxels of padding would hold it",
-        WrapAroundWarning,
+        WrapAroundWarning(
+            f"focus {farthest:g} µm lies {distance:g} µm from the specimen: {100 * part:.2g} % of the light "
+            f"leaves the array and {fate}; {padding} more voxels of padding would hold it",
+            severity=part,
+        ),
         stacklevel=3,  # torch.no_grad is a call between
     )
