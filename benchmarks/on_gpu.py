@@ -9,13 +9,13 @@ written backward. Over the time, that is a bandwidth, here compared with that of
 """
 
 import argparse
-import time
 from collections.abc import Callable
 
 import torch
 from torch.nn import Parameter
 
 from torchdic import Fidelity, Grid, Rays, Volume, trace
+from torchdic.cost import timed
 from torchdic.ray_solver import TABLEAUX
 
 RAY_FORWARD, RAY_BACKWARD = 2 * 5 + 3, 3 + 2 * 5
@@ -80,13 +80,7 @@ def best(run: Callable, device: torch.device, repeats: int) -> tuple[float, str]
     run()
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    seconds = []
-    for _ in range(repeats):
-        wait(device)
-        start = time.perf_counter()
-        run()
-        wait(device)
-        seconds.append(time.perf_counter() - start)
+    seconds = timed(run, repeats, device)
     peak = f"{torch.cuda.max_memory_allocated(device) / 2**30:.1f}" if device.type == "cuda" else "not measured"
     return min(seconds), peak
 
@@ -97,12 +91,6 @@ def copy_bandwidth(device: torch.device) -> float:
     target = torch.empty_like(source)
     seconds, _ = best(lambda: target.copy_(source), device, 10)
     return 2 * source.nbytes / seconds
-
-
-def wait(device: torch.device) -> None:
-    """Until the device has done what it was told to."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 if __name__ == "__main__":

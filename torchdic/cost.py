@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -75,9 +76,21 @@ def seconds(volume: Volume, microscope: Microscope, acquisition: Acquisition, fi
     each = work(short, volume, microscope, brief) / (len(points) * len(microscope.colours()))
     some = max(1, int(TIMED / each))
     few = replace(microscope, condenser=Condenser(condenser.na, points[-some:]), spectrum=None)
-    best = math.inf
-    for _ in range(2):
-        started = time.perf_counter()
-        image(empty, few, brief, short)
-        best = min(best, time.perf_counter() - started)
+    best = min(timed(lambda: image(empty, few, brief, short), 2, volume.delta.device))
     return best * work(fidelity, volume, microscope, acquisition) / work(short, empty, few, brief)
+
+
+def timed(run: Callable[[], object], repeats: int, device: torch.device) -> list[float]:
+    """Seconds of each of several runs, by the clock, until the device is done."""
+
+    def done() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    found = []
+    for _ in range(repeats):
+        started = done()
+        run()
+        found.append(done() - started)
+    return found

@@ -85,8 +85,7 @@ def allotted(
     Raises ShortOfMemoryError where even single sources, their steps computed again, want more than is free.
     """
     free = free_bytes(volume.delta.device)
-    if free is not None:
-        fidelity = replace(fidelity, memory=max(1, min(fidelity.memory, free)))
+    fidelity = _within(fidelity, free)
     found = _foreseen(volume, microscope, acquisition, fidelity, levels)
     shape = "×".join(map(str, volume.grid.shape))
     what = (
@@ -119,10 +118,8 @@ def allotted_to_fields(
         crossing=Demand(0, 0, 0), imaging=imaging, sources=sources, aside=aside, images=images, learned=own or setting
     )
     _, ny, nx = grid.shape
-    budget = fidelity.memory if free is None else max(1, min(fidelity.memory, free))
-    if not scene.learned and transmission.device.type == "cpu":
-        budget = min(budget, CACHED)
-    found = _fitted(scene, ny * nx * transmission.real.element_size(), budget)
+    each = ny * nx * transmission.real.element_size()
+    found = _fitted(scene, each, _within(fidelity, free).memory, transmission.device)
     check_room(found.least, free, f"{len(acquisition.prisms)} × {len(acquisition.focus)} images of {ny}×{nx} pixels")
     return found
 
@@ -371,14 +368,18 @@ def _foreseen(
     momentum, _ = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
     scene = _scene(volume, microscope, acquisition, fidelity, momentum, levels, gradient)
     _, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
-    budget = fidelity.memory
-    if not scene.learned and volume.delta.device.type == "cpu":
-        budget = min(budget, CACHED)
-    return _fitted(scene, ny * nx * volume.delta.element_size(), budget)
+    return _fitted(scene, ny * nx * volume.delta.element_size(), fidelity.memory, volume.delta.device)
 
 
-def _fitted(scene: _Scene, each: int, budget: int) -> Foreseen:
+def _within(fidelity: Fidelity, free: int | None) -> Fidelity:
+    """The fidelity with a budget of what is free, where that is less."""
+    return fidelity if free is None else replace(fidelity, memory=max(1, min(fidelity.memory, free)))
+
+
+def _fitted(scene: _Scene, each: int, budget: int, device: torch.device) -> Foreseen:
     """As few batches as fit into a budget in bytes; each: bytes of a value per pixel."""
+    if not scene.learned and device.type == "cpu":
+        budget = min(budget, CACHED)
 
     def peak(batch: int, *, slabs: bool = False) -> int:
         return math.ceil(scene.values(batch, slabs=slabs) * each)

@@ -10,7 +10,6 @@ Voxels are taken as they are: what finer ones would change is part of the model'
 """
 
 import os
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from statistics import median
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
+from torchdic.cost import timed
 from torchdic.fidelity import Fidelity, Propagation
 from torchdic.grid import Grid
 from torchdic.image_error import image_error
@@ -276,8 +276,8 @@ def _trial(
     return Trial(
         candidate.label,
         candidate,
-        _seconds(lambda: scene.forward(volume, fidelity), repeats, device),
-        _seconds(lambda: scene.backward(volume, fidelity), repeats, device),
+        median(timed(lambda: scene.forward(volume, fidelity), repeats, device)),
+        median(timed(lambda: scene.backward(volume, fidelity), repeats, device)),
         bytes_,
         gradient_bytes,
         None if converged is None else image_error(answer.images, converged.images),
@@ -285,18 +285,6 @@ def _trial(
         None if converged is None else gradient_error(answer.gradient, converged.gradient),
         gradient_error(answer.gradient, wave.gradient),
     )
-
-
-def _seconds(run: Callable[[], object], repeats: int, device: torch.device) -> float:
-    """The median of several runs."""
-    found = []
-    for _ in range(repeats):
-        _finish(device)
-        start = time.perf_counter()
-        run()
-        _finish(device)
-        found.append(time.perf_counter() - start)
-    return median(found)
 
 
 def peak_bytes(run: Callable[[], T], device: torch.device | str = "cpu") -> tuple[T, int]:
@@ -307,11 +295,11 @@ def peak_bytes(run: Callable[[], T], device: torch.device | str = "cpu") -> tupl
     """
     device = torch.device(device)
     if device.type == "cuda":
-        _finish(device)
+        torch.cuda.synchronize(device)
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)
         result = run()
-        _finish(device)
+        torch.cuda.synchronize(device)
         return result, torch.cuda.max_memory_allocated(device) - before
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler tells stderr of each start and stop otherwise
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
@@ -325,8 +313,3 @@ def peak_bytes(run: Callable[[], T], device: torch.device | str = "cpu") -> tupl
         held += event.nbytes()  # pyright: ignore[reportAttributeAccessIssue]
         most = max(most, held)
     return result, most
-
-
-def _finish(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

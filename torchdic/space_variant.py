@@ -57,14 +57,9 @@ class Levels:
         )
         return sum(parts, start=torch.zeros_like(field))
 
-    @property
-    def kept(self) -> int:
-        """Values per source and pixel that autograd keeps for the backward pass."""
-        return kept_by_levels(len(self.defocus))
-
 
 def kept_by_levels(count: int) -> int:
-    """`Levels.kept` of so many levels."""
+    """Values per source and pixel that autograd keeps of so many levels for the backward pass."""
     return 5 * count + 4
 
 

@@ -26,8 +26,6 @@ from torchdic.volume import Volume
 LOWEST_PZ = 0.3
 # Energy up to which waves may grow, where none can be made: beyond it their growth is the slabs', not the specimen's.
 MOST_ENERGY = 1.1
-
-
 # Energy down to which waves may fall where nothing absorbs: beyond it the slabs lose it to waves that they cut.
 LEAST_ENERGY = 0.9
 
