@@ -1,11 +1,11 @@
 """Rays through a volume, with the gradient to every voxel: torchdic against other ways to do the same.
 
-    python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 3] [--ways Torchdic Diffrax ...]
+    python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 5] [--ways Torchdic Diffrax ...]
 
-Each way of ray_rivals.py runs in a process of its own, in turn with the others; times are the least over the processes
-and their three runs each, after a first one that compiles and warms up: wall clock, and in brackets what the process's
-threads took together, which a busy machine disturbs less. Memory is the peak of resident memory above what the imports
-take. Threads: OMP_NUM_THREADS, NUMBA_NUM_THREADS; JAX takes as many as the process may use (`taskset -c 0`). All solve
+Each way of ray_rivals.py runs in processes of its own, in turn with the others. A process's time is the least of three
+runs after a first one that compiles and warms up, by wall clock; the table has the processes' median, and in brackets
+their least and most. Memory is the peak of resident memory above what the imports take, likewise. Threads:
+OMP_NUM_THREADS, NUMBA_NUM_THREADS; JAX takes as many as the process may use (`taskset -c 0`). All solve
 the same ODE by as many Runge-Kutta steps of fourth order, through the same smooth random volume, from the same rays, in
 float32, and the table shows that they land alike (mean OPD in µm, and the gradient's absolute sum). A package that
 isn't installed (`pip install torchdic[bench]`) is reported as missing.
@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from statistics import median
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -42,7 +43,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Rays through a volume: torchdic against other ways.")
     parser.add_argument("--voxels", type=int, nargs=3, default=(64, 256, 256))
     parser.add_argument("--steps", type=int, default=64)
-    parser.add_argument("--repeats", type=int, default=3, help="processes of each way")
+    parser.add_argument("--repeats", type=int, default=5, help="processes of each way")
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--alone", choices=list(WAYS), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -65,17 +66,21 @@ def main() -> None:
         if missing[way]:
             print(f"| {way} | not installed: {', '.join(missing[way])} | | | | | |")
         else:
-            print(row(way, {key: min(r[key] for r in found[way]) for key in found[way][0]}))
+            print(row(way, {key: [run[key] for run in found[way]] for key in found[way][0]}))
 
 
-def row(way: str, least: dict[str, float]) -> str:
+def row(way: str, runs: dict[str, list[float]]) -> str:
     """A line of the table; a way without a gradient has none."""
-    cells = [f"{least['forward']:.2f} s ({least['forward process']:.2f})", f"{least['forward peak']:.0f} MiB"]
-    if "gradient" in least:
-        cells += [f"{least['gradient']:.2f} s ({least['gradient process']:.2f})", f"{least['gradient peak']:.0f} MiB"]
-    else:
-        cells += ["", ""]
-    cells += [f"{least['mean OPD']:.6f}", f"{least['gradient sum']:.4g}" if "gradient" in least else ""]
+    cells = []
+    for run in ("forward", "gradient"):
+        if run not in runs:
+            cells += ["", ""]
+            continue
+        seconds, peaks = runs[run], runs[f"{run} peak"]
+        cells.append(f"{median(seconds):.2f} s ({min(seconds):.2f}–{max(seconds):.2f})")
+        cells.append(f"{median(peaks):.0f} MiB")
+    cells.append(f"{runs['mean OPD'][0]:.6f}")
+    cells.append(f"{runs['gradient sum'][0]:.4g}" if "gradient sum" in runs else "")
     return f"| {way} | {' | '.join(cells)} |"
 
 
@@ -88,25 +93,24 @@ def measure(way: str, shape: tuple[int, ...], steps: int) -> dict[str, float]:
     imported = peak()
     trial = getattr(ray_rivals, way)(delta, steps)
     found = {}
-    found["forward"], found["forward process"], (_, opd) = best(trial.forward)
+    found["forward"], (_, opd) = best(trial.forward)
     found["forward peak"] = peak() - imported
     found["mean OPD"] = float(opd.mean())
     if hasattr(trial, "gradient"):
-        found["gradient"], found["gradient process"], gradient = best(trial.gradient)
+        found["gradient"], gradient = best(trial.gradient)
         found["gradient peak"] = peak() - imported
         found["gradient sum"] = float(np.abs(gradient).sum())
     return found
 
 
 def best(run: Callable) -> tuple:
-    """Seconds of the best of three runs after a first one, of the process's threads together, and what they gave."""
-    result, seconds, process = run(), [], []
+    """Seconds of the best of three runs after a first one, and what they gave."""
+    result, seconds = run(), []
     for _ in range(3):
-        start, used = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         result = run()
         seconds.append(time.perf_counter() - start)
-        process.append(time.process_time() - used)
-    return min(seconds), min(process), result
+    return min(seconds), result
 
 
 def peak() -> float:

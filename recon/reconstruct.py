@@ -3,11 +3,14 @@
 import csv
 import hashlib
 import math
+import signal
+import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -198,7 +201,11 @@ def _descend(
         section,
         step,
     )
-    with _log(out / "log.csv", rows) as log, tqdm(total=section.steps, initial=len(rows), unit="step") as bar:
+    with (
+        _log(out / "log.csv", rows) as log,
+        tqdm(total=section.steps, initial=len(rows), unit="step") as bar,
+        _signals_kept() as check_signals,
+    ):
         try:
             for step in steps:
                 rows.append(_row(step))
@@ -210,17 +217,47 @@ def _descend(
                 bar.update()
                 if step.number % section.checkpoint_every == 0:
                     checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
+                check_signals()
         except KeyboardInterrupt:
             if step is None:
                 raise InterruptedRunError("interrupted before the first step") from None
             if len(rows) < step.number:  # the signal came between the step and its row
                 rows.append(_row(step))
+                log.writerow(rows[-1])
             checkpoint.save(out / CHECKPOINT, Checkpoint(step, rows, identity))
             raise InterruptedRunError(
                 f"interrupted after step {step.number} of {section.steps}; go on with --resume"
             ) from None
     assert step is not None
     return step, rows
+
+
+@contextmanager
+def _signals_kept() -> Iterator[Callable[[], None]]:
+    """Gives what raises KeyboardInterrupt if a signal's was lost: Python ignores one that is raised in a destructor."""
+    received: list[int] = []
+
+    def check() -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    def keeping(handler: Callable[[int, FrameType | None], Any]) -> Callable[[int, FrameType | None], None]:
+        def keep(number: int, frame: FrameType | None) -> None:
+            received.append(number)
+            handler(number, frame)
+
+        return keep
+
+    found = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    main = threading.current_thread() is threading.main_thread()  # which alone may set handlers
+    handlers = {number: handler for number, handler in found.items() if main and callable(handler)}
+    for number, handler in handlers.items():
+        signal.signal(number, keeping(handler))
+    try:
+        yield check
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _row(step: Step) -> Row:

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 # torchdic's files, lowest first: each imports only from files above it in this list.
 LAYERS = (
     "files",
+    "scalar",
     "grid",
     "sampling",
     "volume",

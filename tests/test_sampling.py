@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from torchdic import Grid
-from torchdic.sampling import SliceSampler, depth_weights, spline_coefficients, window
+from torchdic import Acquisition, Fidelity, Grid, Prism, Volume, image
+from torchdic.sampling import SliceSampler, depth_weights, shares, spline_coefficients, window
 
 GRID = Grid((6, 9, 11), (0.5, 0.2, 0.3))
 BOTH = pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -173,3 +173,51 @@ def test_pull_back_skips_voxels_that_no_one_learns():
     found = sampler(GRID, torch.randn(GRID.shape, dtype=torch.float64), "linear")
     y, x = random_places(10)
     assert found.pull_back(0.1, y, x, torch.ones(3, 10, dtype=torch.float64))[1] is None
+
+
+@pytest.fixture
+def threads():
+    """Sets how many threads torch may use, until the test ends."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("rays", "available", "parts"),
+    [(600, 1, 1), (600, 4, 4), (600, 7, 6), (599, 4, 1), (99, 8, 3), (24, 8, 1), (0, 8, 1)],
+)
+def test_threads_share_rays_equally_and_not_too_few(threads, rays, available, parts):
+    """Of 9 × 11 voxels: at least 99/4 rays each."""
+    threads(available)
+    assert shares(GRID, rays, torch.device("cpu")) == parts
+    assert shares(GRID, rays, torch.device("meta")) == 1
+
+
+@BOTH
+@pytest.mark.parametrize("shape", [(300,), (3, 100), (4, 5, 15)], ids=str)
+def test_threads_change_nothing(threads, interpolation, shape):
+    field = torch.randn(GRID.shape, dtype=torch.float64, requires_grad=True)
+    y, x = (v.reshape(shape) for v in random_places(300, 2.0))
+    weights = torch.randn(3, *shape, dtype=torch.float64)
+    results = []
+    for count in (1, 3, 4):
+        threads(count)
+        found = sampler(GRID, field, interpolation)
+        place, plane = found.pull_back(0.2, y, x, weights)
+        results.append((found.sample(0.2, y, x), found.value(0.2, y, x), place, plane))
+    torch.testing.assert_close(results[1], results[0], rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(results[2], results[0], rtol=1e-12, atol=1e-12)
+
+
+def test_threads_change_no_image(threads, small, microscope, smooth_field, propagation):
+    acquisition = Acquisition([Prism((0.1, 0.2), 0.8)], [0.3])
+    results = []
+    for count in (1, 2, 7):
+        threads(count)
+        delta = smooth_field(small, 0.03).requires_grad_()
+        images = image(Volume(small, delta, 1.36), microscope, acquisition, Fidelity(propagation, sources=4))
+        (gradient,) = torch.autograd.grad(images.square().sum(), delta)
+        results.append((images, gradient))
+    torch.testing.assert_close(results[1], results[0], rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(results[2], results[0], rtol=1e-10, atol=1e-10)

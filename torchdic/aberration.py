@@ -259,7 +259,7 @@ def _cross(
     ray = torch.broadcast_tensors(position, momentum)[0].shape[1:]
     state = position.new_zeros(13 if pair else 5, *ray)
     if pair:
-        state[[9, 12]] = 1.0
+        state[9] = state[12] = 1.0
     whole = fidelity.steps or grid.shape[0]
     # a plane one rounding error above a step's end must not cost another step
     steps = math.ceil(whole * (face - plane) / grid.extent[0] - 1e-9)
@@ -359,5 +359,5 @@ def _cone_radius(leaving: _Leaving, cone: Tensor, n0: Tensor, length: float, nea
     target = (u * u + v * v) / size * h / (1 + c * h)
     normal = (basis[..., :, None] * basis[..., None, :]).sum(0)
     right = (basis * target[..., None]).sum(0)
-    m = torch.linalg.solve_ex(normal, right)[0]
-    return m[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
+    uu, uv, vv = torch.linalg.solve_ex(normal, right)[0].unbind(-1)
+    return torch.stack((uu, uv, uv, vv), -1).unflatten(-1, (2, 2))

@@ -16,6 +16,7 @@ from torchdic.grid import Grid
 from torchdic.jones import Polarisation
 from torchdic.objective import Objective
 from torchdic.prism import Prism
+from torchdic.scalar import number
 
 
 class SamplingWarning(UserWarning):
@@ -104,7 +105,7 @@ class Acquisition:
         if len(self.prisms) == 0 or len(self.focus) == 0:
             raise ValueError("an acquisition needs at least one prism (or None for bright field) and one focus plane")
         for focus in self.focus:
-            depth = float(torch.as_tensor(focus, dtype=torch.float64).detach())
+            depth = number(focus)
             if not math.isfinite(depth):
                 raise ValueError(f"focus {depth} must be a finite depth in µm")
         object.__setattr__(self, "prisms", tuple(self.prisms))

@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float, Inexact
 from torch import Tensor
 
 from torchdic.jones_pupil import JonesPupil
+from torchdic.scalar import number, scalar
 
 
 def linear(angle: float | Tensor) -> Float[Tensor, "*batch 2"]:
@@ -120,11 +121,11 @@ class Polarisation:
             value = getattr(self, field.name)
             if value is None or field.name == "pupil":
                 continue
-            number = float(torch.as_tensor(value, dtype=torch.float64).detach())
-            if not math.isfinite(number):
-                raise ValueError(f"{field.name} {number} must be a finite number")
-            if field.name.endswith("extinction") and not (0 <= number < 1):
-                raise ValueError(f"{field.name} {number} must be at least 0 and below 1: a share of crossed light")
+            plain = number(value)
+            if not math.isfinite(plain):
+                raise ValueError(f"{field.name} {plain} must be a finite number")
+            if field.name.endswith("extinction") and not (0 <= plain < 1):
+                raise ValueError(f"{field.name} {plain} must be at least 0 and below 1: a share of crossed light")
 
     @property
     def ideal(self) -> bool:
@@ -193,7 +194,7 @@ class Polarisation:
             one, two = one * condenser, two * condenser.conj()
         laboratory = torch.stack((cos * one - sin * two, sin * one + cos * two), -1)
         x, y = _behind(pupil, laboratory, turned).unbind(3)
-        prism = torch.polar(torch.ones_like(half), half + torch.as_tensor(bias, dtype=kind, device=device) / 2)
+        prism = torch.polar(torch.ones_like(half), half + scalar(bias, half) / 2)
         beams = prism * (cos * x + sin * y), prism.conj() * (cos * y - sin * x)
         first, second = analysed.to(device, kind)[:, :, None, None, None, None, None].unbind(1)
         return weights, (first * beams[0] + second * beams[1]).flatten(0, 1)

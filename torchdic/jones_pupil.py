@@ -33,6 +33,7 @@ from jaxtyping import Complex, Float, Inexact
 from torch import Tensor
 
 from torchdic.objective import zernike
+from torchdic.scalar import number, scalar
 
 PauliZernike = Mapping[int, Sequence[float | Tensor]]
 
@@ -61,9 +62,9 @@ class JonesPupil:
                 if len(pair) != 2:
                     raise ValueError(f"{name} {noll}: {len(pair)} values, it takes 2: along x and y, and at 45°")
                 for value in pair:
-                    number = float(torch.as_tensor(value, dtype=torch.float64).detach())
-                    if not math.isfinite(number):
-                        raise ValueError(f"{name} {noll}: {number} must be a finite number")
+                    plain = number(value)
+                    if not math.isfinite(plain):
+                        raise ValueError(f"{name} {noll}: {plain} must be a finite number")
 
     @property
     def strained(self) -> bool:
@@ -137,7 +138,7 @@ def _pauli_zernike(coefficients: PauliZernike, pupil: Tensor) -> Tensor:
     rho, theta = pupil.square().sum(1).sqrt(), torch.atan2(pupil[:, 0], pupil[:, 1])
     total = rho.new_zeros(())
     for noll, pair in coefficients.items():
-        c = torch.stack([torch.as_tensor(value, dtype=rho.dtype, device=rho.device) for value in pair])
+        c = torch.stack([scalar(value, rho) for value in pair])
         total = total + c[:, None, None, None] * zernike(noll, rho, theta)
     return total
 

@@ -18,6 +18,7 @@ from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
 from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
 from torchdic.rays import TurnedRaysError
+from torchdic.scalar import number
 from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
@@ -193,7 +194,7 @@ def needed_padding(scene: Scene) -> int:
     if not gaps or min(gaps.values()) == 0:
         return 0
     depths = [grid.centre(0, i) for i in spans[0]]
-    distance = max(abs(float(torch.as_tensor(z)) - d) for z, d in itertools.product(acquisition.focus, depths))
+    distance = max(abs(number(z) - d) for z, d in itertools.product(acquisition.focus, depths))
     n0 = float(volume.background)
     sine = min((n0 if microscope.objective is None else microscope.objective.na) / n0, 0.95)
     shear = max((float(torch.as_tensor(p.shear).abs().max()) for p in acquisition.prisms if p is not None), default=0.0)

@@ -17,6 +17,7 @@ from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import Deviation, TurnedRaysError, axial_momentum, deviation, kept_by_rays, launch, steps_of
 from torchdic.recompute import Demand, indices
+from torchdic.scalar import scalar
 from torchdic.volume import Volume
 
 # Rows and columns of rays traced around the array, from where rays may be bent into it.
@@ -172,7 +173,7 @@ class _Mesh:
     def __init__(self, grid: Grid, displacement: Tensor) -> None:
         device = displacement.device
         self.shape = grid.shape[1:]
-        self.spacing = displacement.new_tensor(grid.spacing[1:])
+        self.spacing = torch.stack([scalar(d, displacement) for d in grid.spacing[1:]])
         my, mx = displacement.shape[1:3]
         # beyond the traced margin rays are displaced as at its rim, where the index is constant across it
         rim = torch.ones(my, mx, dtype=torch.bool, device=device)
@@ -223,16 +224,16 @@ class _Mesh:
         # source by source: there are up to four pairs for each that holds
         found = [self._covered_by_one(part) for part in self.home + self.flat(displacement) / self.spacing]
         triangles, pixels = zip(*found, strict=True)
-        counts = torch.tensor([len(triangle) for triangle in triangles], device=displacement.device)
-        source = torch.repeat_interleave(torch.arange(len(found), device=displacement.device), counts)
+        source = torch.cat([torch.full_like(triangle, i) for i, triangle in enumerate(triangles)])
         return source, torch.cat(triangles), torch.cat(pixels)
 
     def _covered_by_one(self, moved: Float[Tensor, "vertex 2"]) -> tuple[Tensor, Tensor]:
         """`covered` of one source, whose vertices have been moved to fractional pixels: triangle (n,), pixel (n, 2)."""
         corner = moved[self.triangles]
-        limit = torch.tensor(self.shape, device=moved.device)
         low = corner.amin(1).ceil().clamp_min(0)
-        high = torch.minimum(corner.amax(1).floor(), limit - 1)
+        last_row, last_column = corner.amax(1).floor().unbind(1)
+        ny, nx = self.shape
+        high = torch.stack((last_row.clamp_max(ny - 1), last_column.clamp_max(nx - 1)), 1)
         extent = (high - low + 1).clamp_min(0).long()
         count = extent.prod(-1)
         triangle = torch.repeat_interleave(torch.arange(len(count), device=moved.device), count)
@@ -252,7 +253,8 @@ class _Mesh:
             arm = pixel - torch.where(direct[:, None], start, end)
             left = torch.where(direct, 1, -1) * _cross(torch.where(direct[:, None], end - start, start - end), arm) >= 0
             inside &= (left == (one < other)) == orientation
-        return triangle[inside], pixel[inside]
+        held = inside.nonzero()[:, 0]
+        return triangle[held], pixel[held]
 
 
 def _crossed(leaving: Tensor, landed: Tensor) -> Tensor:

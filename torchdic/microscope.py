@@ -19,6 +19,7 @@ from torchdic.memory import Foreseen, allotted, allotted_to_fields, levels_of
 from torchdic.passband import interpolate
 from torchdic.projection import project
 from torchdic.recompute import sum_over_sources
+from torchdic.scalar import number, scalar
 from torchdic.space_variant import Levels
 from torchdic.volume import Volume
 from torchdic.wave import axial_difference, paraxial_difference, split_step, to_spectrum
@@ -33,7 +34,7 @@ def image(
     aperture exceeds the medium's index, and ShortOfMemoryError where it would take more memory than is free; warns with
     SamplingWarning where the voxels are coarser than the light.
     """
-    check_apertures(microscope, float(volume.background.detach()), volume.delta.dtype)
+    check_apertures(microscope, number(volume.background), volume.delta.dtype)
     check_sampling(microscope, volume.grid)
     plan = allotted(volume, microscope, acquisition, fidelity)
     colours = microscope.colours()
@@ -143,13 +144,13 @@ def image_field(
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))
     real = transmission.real
-    check_apertures(microscope, float(torch.as_tensor(background, dtype=torch.float64).detach()), real.dtype)
+    check_apertures(microscope, number(background), real.dtype)
     check_sampling(microscope, grid)
     momentum, weights = microscope.sources(fidelity, dtype=real.dtype, device=real.device)
     expected = (*((len(weights),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
-    n0 = torch.as_tensor(background, dtype=real.dtype, device=real.device)
+    n0 = scalar(background, real)
     pad = fidelity.padding
     grid = grid.widened(pad, pad)
     plan = allotted_to_fields(transmission, grid, n0, len(weights), microscope, acquisition, fidelity)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from torchdic.scalar import number, scalar
 from torchdic.wave import exp_i
 
 # Relative difference up to which more lengths than the lens law needs count as agreeing.
@@ -30,10 +31,10 @@ class Layer:
     design_index: float | Tensor
 
     def __post_init__(self) -> None:
-        thickness = _number(self.thickness)
+        thickness = number(self.thickness)
         if not math.isfinite(thickness):
             raise ValueError(f"layer thickness {thickness} µm must be a finite number")
-        for name, value in (("index", _number(self.index)), ("design_index", _number(self.design_index))):
+        for name, value in (("index", number(self.index)), ("design_index", number(self.design_index))):
             if not (1 <= value < math.inf):
                 raise ValueError(f"layer {name} {value} must be a refractive index of at least 1")
 
@@ -44,10 +45,7 @@ class Layer:
         small angles the plane z_f + t·n0·(1/n − 1/n_d) is sharp instead of z_f. Beyond these it is the spherical
         aberration of Gibson & Lanni, J. Opt. Soc. Am. A 8, 1601 (1991).
         """
-        t, n, design = (
-            torch.as_tensor(v, dtype=momentum.dtype, device=momentum.device)
-            for v in (self.thickness, self.index, self.design_index)
-        )
+        t, n, design = (scalar(v, momentum) for v in (self.thickness, self.index, self.design_index))
         transverse = momentum.square().sum(1)
         propagates = (transverse < n.square()) & (transverse < design.square())
         transverse = torch.where(propagates, transverse, 0)  # keeps roots of negative numbers out of the gradient
@@ -78,13 +76,13 @@ class Objective:
         for index, value in (self.aberrations or {}).items():
             if isinstance(index, bool) or not isinstance(index, int) or index < 1:
                 raise ValueError(f"aberration {index!r}: a Noll index is a whole number from 1")
-            coefficient = float(torch.as_tensor(value, dtype=torch.float64).detach())
+            coefficient = number(value)
             if not math.isfinite(coefficient):
                 raise ValueError(f"aberration {index}: {coefficient} rad must be a finite number")
         if self.apodisation not in (None, "aplanatic"):
             raise ValueError(f"apodisation {self.apodisation!r} must be 'aplanatic' or absent")
         if self.layer is not None:
-            lowest = min(_number(self.layer.index), _number(self.layer.design_index))
+            lowest = min(number(self.layer.index), number(self.layer.design_index))
             if self.na > lowest:
                 raise ValueError(f"objective NA {self.na:g} exceeds the layer's index {lowest:g}")
 
@@ -99,10 +97,7 @@ class Objective:
             return None
         pupil = momentum / self.na
         rho, theta = pupil.square().sum(1).sqrt(), torch.atan2(pupil[:, 0], pupil[:, 1])
-        terms = [
-            torch.as_tensor(value, dtype=rho.dtype, device=rho.device) * zernike(index, rho, theta)
-            for index, value in self.aberrations.items()
-        ]
+        terms = [scalar(value, rho) * zernike(index, rho, theta) for index, value in self.aberrations.items()]
         return torch.stack(terms).sum(0)
 
     def transfer(
@@ -201,10 +196,6 @@ def thin_lens(
     if b is None:
         b = f * a / (a - f) if m is None and f is not None else a * known["magnification"]
     return ThinLens(a * b / (a + b) if f is None else f, a, b, b / a if m is None else m)
-
-
-def _number(value: float | Tensor) -> float:
-    return float(torch.as_tensor(value, dtype=torch.float64).detach())
 
 
 def zernike(noll: int, rho: Tensor, theta: Tensor) -> Tensor:

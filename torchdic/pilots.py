@@ -13,6 +13,7 @@ from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope
 from torchdic.microscope import image
+from torchdic.scalar import number
 from torchdic.volume import Volume
 from torchdic.wave import UnstableError
 
@@ -74,10 +75,10 @@ class Scene:
         They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
         """
         prisms = self.acquisition.prisms
-        levels = [1.0 if p is None else math.sin(float(torch.as_tensor(p.bias)) / 2) ** 2 for p in prisms]
+        levels = [1.0 if p is None else math.sin(number(p.bias) / 2) ** 2 for p in prisms]
         shears = [0.0 if p is None else float(torch.as_tensor(p.shear, dtype=torch.float64).norm()) for p in prisms]
         picked = {levels.index(min(levels)), levels.index(max(levels)), shears.index(max(shears)), len(prisms) - 1}
-        depths = [float(torch.as_tensor(z)) for z in self.acquisition.focus]
+        depths = [number(z) for z in self.acquisition.focus]
         plane = self.volume.mean_plane()
         away = [abs(z - plane) for z in depths]
         planes = {depths.index(min(depths)), away.index(min(away)), depths.index(max(depths))}
@@ -149,7 +150,8 @@ class Scene:
 
         def cut(part: Tensor) -> Tensor:
             inside = part[:, row : row + size[0], column : column + size[1]]
-            rim = torch.cat((inside[:, [0, -1]].flatten(1), inside[:, :, [0, -1]].flatten(1)), 1).mean(1)[:, None, None]
+            sides = inside[:, :1], inside[:, -1:], inside[:, :, :1], inside[:, :, -1:]
+            rim = torch.cat([side.flatten(1) for side in sides], 1).mean(1)[:, None, None]
             return rim + (inside - rim) * fade
 
         delta, absorption = (None if part is None else cut(part) for part in (volume.delta, volume.absorption))

@@ -18,6 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchdic.scalar import number, scalar
+
 # Ordinary and extraordinary index at 546.1 nm: the dispersion equations of G. Ghosh, Opt. Commun. 163, 95 (1999).
 MATERIALS = {"quartz": (1.54614, 1.55531), "calcite": (1.66160, 1.48765)}
 
@@ -44,9 +46,9 @@ class Prism:
         for name, value in named.items():
             if value is None:
                 continue
-            number = float(torch.as_tensor(value, dtype=torch.float64).detach())
-            if not math.isfinite(number):
-                raise ValueError(f"{name} {number} must be a finite number")
+            plain = number(value)
+            if not math.isfinite(plain):
+                raise ValueError(f"{name} {plain} must be a finite number")
 
     @classmethod
     def senarmont(
@@ -92,9 +94,9 @@ class Prism:
                 raise ValueError(f"material {material!r} must be one of {', '.join(map(repr, MATERIALS))}")
             indices = MATERIALS[material]
         for name, value in (("focal length", focal_length), ("wavelength", wavelength)):
-            if not (0 < float(torch.as_tensor(value).detach()) < math.inf):
+            if not (0 < number(value) < math.inf):
                 raise ValueError(f"{name} {float(value)} µm must be above 0")
-        if not (abs(float(torch.as_tensor(angle).detach())) < math.pi / 2):
+        if not (abs(number(angle)) < math.pi / 2):
             raise ValueError(f"wedge angle {float(angle)} rad must lie between −π/2 and π/2")
         length = math.hypot(*direction)
         if not (0 < length < math.inf):
@@ -125,7 +127,7 @@ class Prism:
     def polarised_along(self, like: Tensor) -> Float[Tensor, " 2"]:
         """(cos, sin) of the angle from +x towards +y along which beam 1 is polarised, in the dtype of `like`."""
         if self.axis is not None:
-            axis = torch.as_tensor(self.axis, dtype=like.dtype, device=like.device)
+            axis = scalar(self.axis, like)
             return torch.stack((axis.cos(), axis.sin()))
         y, x = self._shear(like)
         squared = y.square() + x.square()
@@ -134,9 +136,9 @@ class Prism:
         return torch.stack((torch.where(nowhere, 1, x / length), torch.where(nowhere, 0, y / length)))
 
     def _half_difference(self, frequencies: Tensor) -> Tensor:
-        half_bias = torch.as_tensor(self.bias, dtype=frequencies.dtype, device=frequencies.device) / 2
+        half_bias = scalar(self.bias, frequencies) / 2
         return self.shear_phase(frequencies) + half_bias
 
     def _shear(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        y, x = (torch.as_tensor(s, dtype=like.dtype, device=like.device) for s in self.shear)
+        y, x = (scalar(s, like) for s in self.shear)
         return y, x

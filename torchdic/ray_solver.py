@@ -33,17 +33,22 @@ TABLEAUX: dict[Solver, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] 
 
 
 def solve(
-    equation: RayEquation, state: Float[Tensor, "component *ray"], depths: Float[Tensor, " depth"], fidelity: Fidelity
+    equation: RayEquation,
+    state: Float[Tensor, "component *ray"],
+    depths: Float[Tensor, " depth"],
+    fidelity: Fidelity,
+    watch: Callable[[int, Tensor], None] = lambda *_: None,
 ) -> Float[Tensor, "component *ray"]:
     """The state at the last of some depths in µm, from the one at the first.
 
     A method of equal steps takes one from each depth to the next. Depths belong on the CPU: one read from another
     device would make every stage wait for it. Of `fidelity` solver and tolerance are read. A ray that can't go on
-    toward +z ends as nan.
+    toward +z ends as nan. watch: is shown, after each of equal steps, its number from 0
+    and the moving components, without a graph.
     """
     if fidelity.solver not in ADAPTIVE:
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in (state, *equation.tensors))
-        return _EqualSteps.apply(equation, depths, fidelity.solver, keep, state, *equation.tensors)  # pyright: ignore[reportReturnType]
+        return _EqualSteps.apply(equation, depths, fidelity.solver, keep, watch, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
     def slopes(z: Tensor, state: Tensor) -> Tensor:
         return _Evaluation.apply(equation, float(z), state, *equation.tensors)  # pyright: ignore[reportReturnType]
@@ -87,6 +92,7 @@ class _EqualSteps(torch.autograd.Function):
         depths: Tensor,
         solver: Solver,
         keep: bool,
+        watch: Callable[[int, Tensor], None],
         state: Tensor,
         *tensors: Tensor,
     ) -> Tensor:
@@ -96,13 +102,17 @@ class _EqualSteps(torch.autograd.Function):
 
         def slopes(z: float, state: Tensor) -> Tensor:
             met = equation.meet(z, state[:MOVING])
+            step, stage = divmod(next(evaluations), stages)
+            if stage == 0 and step > 0:  # a step begins where the last one has ended
+                watch(step - 1, met.moving)
             if keep:
-                if next(evaluations) % stages == 0:  # a first stage is where its step begins
+                if stage == 0:
                     kept.append(met.moving.clone())  # without the sums beside it
                 kept.extend([met.sampled] if met.kappa is None else [met.sampled, met.kappa])
             return equation.slopes(met)
 
         end = equal_steps(slopes, state, depths, solver)
+        watch(len(depths) - 2, end[:MOVING])
         ctx.settings = _maker(equation), depths, solver
         ctx.save_for_backward(*tensors, *kept)
         return end
@@ -141,7 +151,7 @@ class _EqualSteps(torch.autograd.Function):
                 gradients.add(stages[i], pulled)
                 stage_bars.append(pulled.moving)
             moving_bar = sum(stage_bars[1:], moving_bar + stage_bars[0])
-        return (None, None, None, None, torch.cat((moving_bar, sums_bar)), *gradients.bars)
+        return (*[None] * 5, torch.cat((moving_bar, sums_bar)), *gradients.bars)
 
 
 class _Evaluation(torch.autograd.Function):

@@ -27,10 +27,10 @@ from torch import Tensor
 
 from torchdic.fidelity import ADAPTIVE, Fidelity
 from torchdic.grid import Grid
-from torchdic.ray_equation import RayEquation
+from torchdic.ray_equation import MOVING, RayEquation
 from torchdic.ray_solver import TABLEAUX, solve
 from torchdic.recompute import recompute, slabs
-from torchdic.sampling import SliceSampler, window
+from torchdic.sampling import SliceSampler, shares, window
 from torchdic.volume import Volume
 
 
@@ -138,18 +138,23 @@ def deviation(
     position, momentum = (v.movedim(-1, 0) for v in torch.broadcast_tensors(rays.position, rays.momentum))
     pz0 = axial_momentum(n0, rays.momentum).expand(momentum.shape[1:])
     straight = torch.cat((position, momentum / pz0, momentum, pz0[None]))
+    shape = straight.shape[1:]
+    straight = straight.reshape(7, shares(grid, shape.numel(), straight.device), -1)
 
     watched = 0
 
-    def cross(first: int, last: int, state: Tensor) -> Tensor:
+    def show(step: int, moving: Tensor) -> None:
         nonlocal watched
-        if watch is None:
+        if watch is not None and step == watched:  # not when it is computed again
+            watch(moving.reshape(-1, *shape))
+            watched += 1
+
+    def cross(first: int, last: int, state: Tensor) -> Tensor:
+        if watch is None or equal_steps:
             return advance(first, last, state)
         for step in range(first, last):
             state = advance(step, step + 1, state)
-            if step == watched:  # not when it is computed again
-                watch(state[:4].detach())
-                watched += 1
+            show(step, state[:MOVING].detach())
         return state
 
     def advance(first: int, last: int, state: Tensor) -> Tensor:
@@ -159,7 +164,8 @@ def deviation(
         near = window(grid, float(seen[0]), float(seen[-1]), fidelity.interpolation)
         index, *absorption = (SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices)
         kappa = absorption[0] if absorption else None
-        return solve(RayEquation(straight, n0, index, kappa, face, turn), state, times, fidelity)
+        equation = RayEquation(straight, n0, index, kappa, face, turn)
+        return solve(equation, state, times, fidelity, lambda step, moving: show(first + step, moving))
 
     state = straight.new_zeros(4 + len(fields) + turn, *straight.shape[1:])
     equal_steps = fidelity.solver not in ADAPTIVE
@@ -171,6 +177,7 @@ def deviation(
     crowded = kept * state[0].numel() * state.element_size() > fidelity.memory
     for first, last in slabs(steps, split=crowded and equal_steps):
         state = recompute(cross, first, last, state, when=crowded)
+    state = state.reshape(len(state), *shape)
     stopped = ~torch.isfinite(state[4])
     if bool(stopped.any()):
         raise TurnedRaysError.of(stopped)

@@ -87,14 +87,15 @@ class SliceSampler:
                 return _by_autograd(self.sample_plane, self.plane(z), y, x, sampled_bar, learned)
             channels, where = self._channels(z), self._where(y, x, ring=1)
             # what autograd would call, without a second forward pass
-            channels_bar, where_bar = torch.ops.aten.grid_sampler_2d_backward(
-                sampled_bar.reshape(1, 3, 1, -1), channels[None], where, 0, 1, True, [learned, True]
+            shared, (share, _, rays, _) = _shared(channels, where), where.shape
+            shared_bar, where_bar = torch.ops.aten.grid_sampler_2d_backward(
+                sampled_bar.reshape(3, share, 1, rays).transpose(0, 1), shared, where, 0, 1, True, [learned, True]
             )
             scale_y, scale_x = self._scales(ring=1)
-            place_bar = torch.empty_like(sampled_bar[:2]).reshape(2, -1)
-            torch.mul(where_bar[0, 0, :, 1], scale_y, out=place_bar[0])
-            torch.mul(where_bar[0, 0, :, 0], scale_x, out=place_bar[1])
-            plane_bar = self._with_slopes_pull_back(channels_bar[0]) if learned else None
+            place_bar = sampled_bar.new_empty(2, share, rays)
+            torch.mul(where_bar[:, 0, :, 1], scale_y, out=place_bar[0])
+            torch.mul(where_bar[:, 0, :, 0], scale_x, out=place_bar[1])
+            plane_bar = self._with_slopes_pull_back(shared_bar.sum(0)) if learned else None
             return place_bar.reshape(2, *y.shape), plane_bar
 
     def pull_back_value(
@@ -150,11 +151,12 @@ class SliceSampler:
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
         return 2 / (dy * (max(ny + 2 * ring, 2) - 1)), 2 / (dx * (max(nx + 2 * ring, 2) - 1))
 
-    def _where(self, y: Tensor, x: Tensor, ring: int = 0) -> Float[Tensor, "1 1 ray 2"]:
+    def _where(self, y: Tensor, x: Tensor, ring: int = 0) -> Float[Tensor, "share 1 ray 2"]:
         """Positions in µm as grid_sample's coordinates (x, y), on a field with `ring` voxels more on each side."""
         scale_y, scale_x = self._scales(ring)
         # x and y apart in memory, as the kernel likes them best
-        return torch.stack((x.reshape(-1) * scale_x, y.reshape(-1) * scale_y)).T[None, None]
+        where = torch.stack((x * scale_x, y * scale_y))
+        return where.reshape(2, shares(self.grid, y.numel(), y.device), 1, -1).permute(1, 2, 3, 0)
 
     def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
@@ -169,8 +171,15 @@ def _thick(channels: Float[Tensor, "c y x"]) -> Float[Tensor, "c yy xx"]:
     return channels
 
 
-def _grid_sample(channels: Float[Tensor, "c y x"], where: Float[Tensor, "1 1 ray 2"]) -> Float[Tensor, "c ray"]:
-    return F.grid_sample(channels[None], where, padding_mode="border", align_corners=True)[0, :, 0]
+def _grid_sample(
+    channels: Float[Tensor, "c y x"], where: Float[Tensor, "share 1 ray 2"]
+) -> Float[Tensor, "c share ray"]:
+    shared = _shared(channels, where)
+    return F.grid_sample(shared, where, padding_mode="border", align_corners=True)[:, :, 0].transpose(0, 1)
+
+
+def _shared(channels: Float[Tensor, "c y x"], where: Float[Tensor, "share 1 ray 2"]) -> Float[Tensor, "share c y x"]:
+    return channels.expand(len(where), *channels.shape)
 
 
 def _by_autograd(
@@ -182,6 +191,19 @@ def _by_autograd(
         sampled = sample(inputs[2] if learned else plane, inputs[0], inputs[1])
     y_bar, x_bar, *plane_bar = torch.autograd.grad(sampled, inputs, sampled_bar)
     return torch.stack((y_bar, x_bar)), plane_bar[0] if learned else None
+
+
+def shares(grid: Grid, rays: int, device: torch.device) -> int:
+    """How many equal parts `SliceSampler` makes of that many rays: grid_sample gives each to a thread of the CPU.
+
+    Rays of shape (share, ray) are divided without a copy. A part adds up the slice's gradient by itself, so it has a
+    quarter as many rays as the slice has voxels, or more.
+    """
+    if device.type != "cpu":
+        return 1
+    _, ny, nx = grid.shape
+    most = min(torch.get_num_threads(), 4 * rays // (ny * nx))
+    return next((count for count in range(most, 1, -1) if rays % count == 0), 1)
 
 
 def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from torchdic.grid import Grid
 from torchdic.sampling import Interpolation, spline_coefficients
+from torchdic.scalar import number, scalar
 
 
 class Volume(nn.Module):
@@ -35,7 +36,7 @@ class Volume(nn.Module):
             _check_field("absorption", absorption, grid)
             if bool((absorption < 0).any()):
                 raise ValueError(f"absorption {float(absorption.detach().min()):g} is negative: κ must be at least 0")
-        index = float(torch.as_tensor(background, dtype=torch.float64).detach())
+        index = number(background)
         if not (index > 0 and index < float("inf")):
             raise ValueError(f"background {index} must be a refractive index above 0")
         lowest = index + float(delta.detach().min())
@@ -43,7 +44,7 @@ class Volume(nn.Module):
             raise ValueError(f"index {lowest:g} = background {index:g} + delta must stay above 0")
         self.grid = grid
         self._keep("delta", delta)
-        self._keep("background", torch.as_tensor(background, dtype=delta.dtype, device=delta.device))
+        self._keep("background", scalar(background, delta))
         self._keep("absorption", None if absorption is None else absorption.to(delta))
 
     def _keep(self, name: str, value: Tensor | None) -> None:

@@ -28,6 +28,7 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope, check_apertures
 from torchdic.prism import Prism
 from torchdic.recompute import sum_over_sources
+from torchdic.scalar import scalar
 from torchdic.volume import Volume
 from torchdic.wave import LOWEST_PZ, axial_difference, exp_i, to_field, to_spectrum
 
@@ -44,7 +45,7 @@ def two_beam_image(phase: Float[Tensor, "y x"], grid: Grid, prism: Prism) -> Flo
     if tuple(phase.shape) != grid.shape[1:]:
         raise ValueError(f"phase has shape {tuple(phase.shape)}, the grid asks for {grid.shape[1:]} (y, x)")
     frequencies = grid.frequencies(dtype=phase.dtype, device=phase.device)
-    sy, sx, bias = (torch.as_tensor(v, dtype=phase.dtype, device=phase.device) for v in (*prism.shear, prism.bias))
+    sy, sx, bias = (scalar(v, phase) for v in (*prism.shear, prism.bias))
     shift = math.pi * (frequencies[0] * sy + frequencies[1] * sx)
     spectrum = to_spectrum(phase)
     ahead, behind = (to_field(spectrum * exp_i(sign * shift)).real for sign in (1, -1))
@@ -173,8 +174,8 @@ def _kernel(
         return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
     depths, overlaps = _slabs(grid, fidelity, dtype, device)
-    foci = torch.stack([torch.as_tensor(z, dtype=dtype, device=device) for z in acquisition.focus])
     momentum, weights = microscope.sources(fidelity, dtype=dtype, device=device)
+    foci = torch.stack([scalar(z, momentum) for z in acquisition.focus])
 
     def contribution(momentum: Tensor, weights: Tensor) -> Tensor:
         difference, pz = axial_difference(grid, microscope.wavelength, background, momentum)

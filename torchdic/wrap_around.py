@@ -9,6 +9,7 @@ than π from one frequency of the array to the next.
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Complex, Float
@@ -17,6 +18,7 @@ from torch import Tensor
 from torchdic.grid import Grid
 from torchdic.instrument import Acquisition
 from torchdic.recompute import BatchWarning
+from torchdic.scalar import number
 
 # Part of an image's light that may wrap around unremarked: its root is about what it changes an image by.
 UNREMARKED = 1e-4
@@ -47,7 +49,7 @@ class Spread:
 
         A wave is referred to the last face, and back to its middle spreads no more.
         """
-        depth = float(torch.as_tensor(focus).detach())
+        depth = number(focus)
         return min(abs(depth - self.plane), abs(depth))
 
     @torch.no_grad()
@@ -56,18 +58,27 @@ class Spread:
 
         Over a distance d a wave of momentum p moves sideways by d·p/p_z.
         """
-        n0, most = float(self.background), float(self.na)
+        n0, steepest = self._steepest
         shape, spacing = self.grid.shape[1:], self.grid.spacing[1:]
         sides = [n * d for n, d in zip(shape, spacing, strict=True) if n > 1]
-        steepest = most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
         if not sides or distance == 0 or distance * steepest <= min(sides) / 2:
             return None
         waves = self.momentum[:, :, None, None] + self.wavelength * self.frequencies
         squared = n0**2 - waves.square().sum(1)
         slope = waves.abs() / torch.where(squared > 0, squared, torch.inf).sqrt()[:, None]
-        size, voxel = (waves.new_tensor(v)[:, None, None] for v in (shape, spacing))
         # across one voxel there is nowhere to go
-        return torch.where(size > 1, distance * slope / voxel - size / 2, -torch.inf).amax(1)
+        across = [
+            distance * slope[:, axis] / d - n / 2
+            for axis, (n, d) in enumerate(zip(shape, spacing, strict=True))
+            if n > 1
+        ]
+        return torch.stack(across).amax(0)
+
+    @cached_property
+    def _steepest(self) -> tuple[float, float]:
+        """The background's index, and the largest p/p_z of a wave."""
+        n0, most = number(self.background), number(self.na)
+        return n0, most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
 
     @property
     def direct(self) -> Bool[Tensor, "*source y x"]:
@@ -95,7 +106,7 @@ def check_wrap_around(
 
     spectrum: of what the pupil passes. cut: whether that light is cut. Where nothing can leave, nothing is computed.
     """
-    distance, farthest = max((spread.distance(focus), float(torch.as_tensor(focus))) for focus in acquisition.focus)
+    distance, farthest = max((spread.distance(focus), number(focus)) for focus in acquisition.focus)
     beyond = spread.beyond(distance)
     if beyond is None:
         return
