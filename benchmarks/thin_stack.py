@@ -6,9 +6,10 @@ The case of tests/data/thin_dic.npz: 129 × 129 pixels, 7 focus planes, 437 dire
 second moment of those directions: the grid's steps miss the disc's edge by a little, and by how much they err
 themselves is what 4000 directions on rings, which are as good as the disc, differ by. Errors are the rms and, in
 brackets, the largest over the pixels, in units of the empty bright field: at focus 0 of the reference's images,
-elsewhere, where its defocus is paraxial, of our own 437 directions with the exact one. The rival is what one writes in NumPy without further thought: a transform
-of the object, its transfer functions of each source and plane made beforehand, and an inverse one for each source and
-plane. Times are of one stack in DIC: the least of the repeats, taken in turn, of wall clock and of the process.
+elsewhere, where its defocus is paraxial, of our own 437 directions with the exact one. The rival is what one writes in
+NumPy without further thought: a transform of the object, its transfer functions of each source and plane made
+beforehand, and an inverse one for each source and plane. Times are of one stack in DIC: the least of the repeats, taken
+in turn, of wall clock and of the process.
 """
 
 import argparse
