@@ -37,7 +37,8 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/exact_fields.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench]" || \
 		echo "the rivals of benchmarks/rays.py can't be installed: reported as missing"
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python benchmarks/rays.py
+	$(BIN)/python benchmarks/rays.py
+	$(BIN)/python benchmarks/threads.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/scaling.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/thin_stack.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/whole.py
