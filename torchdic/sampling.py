@@ -37,6 +37,7 @@ class SliceSampler:
         self.grid, self.slices, self.first = grid, slices, first
         self.interpolation: Interpolation = interpolation
         self._around: dict[int, Tensor] = {}
+        self._blended: tuple[float, Tensor] | None = None
 
     def sample(self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]) -> Float[Tensor, "3 *ray"]:
         """The field and its derivatives along y and x (1/µm) at depth z and positions (y, x) in µm."""
@@ -113,12 +114,15 @@ class SliceSampler:
         """`_with_slopes` of the slice blended for depth z."""
         if torch.is_grad_enabled():
             return self._with_slopes(self.plane(z))
+        if self._blended is not None and self._blended[0] == z:  # a step begins where another has ended
+            return self._blended[1]
         # the slopes of a blend are the blend of the slopes: those of a slice serve as long as rays are beside it
         weights = depth_weights(self.grid, z, "linear")
         known = self._around
         self._around = {i: known[i] if i in known else self._with_slopes(self.slices[i - self.first]) for i in weights}
         (channels, *others), (_, *further) = self._around.values(), weights.values()
-        return torch.lerp(channels, others[0], further[0]) if others else channels
+        self._blended = z, torch.lerp(channels, others[0], further[0]) if others else channels
+        return self._blended[1]
 
     def _with_slopes(self, field: Float[Tensor, "y x"]) -> Float[Tensor, "3 yy xx"]:
         """A field and its central differences, on one ring of voxels more."""
@@ -155,7 +159,12 @@ class SliceSampler:
         """Positions in µm as grid_sample's coordinates (x, y), on a field with `ring` voxels more on each side."""
         scale_y, scale_x = self._scales(ring)
         # x and y apart in memory, as the kernel likes them best
-        where = torch.stack((x * scale_x, y * scale_y))
+        if torch.is_grad_enabled():
+            where = torch.stack((x * scale_x, y * scale_y))
+        else:
+            where = x.new_empty(2, *x.shape)
+            torch.mul(x, scale_x, out=where[0])
+            torch.mul(y, scale_y, out=where[1])
         return where.reshape(2, shares(self.grid, y.numel(), y.device), 1, -1).permute(1, 2, 3, 0)
 
     def _indices(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
