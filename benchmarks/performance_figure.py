@@ -9,7 +9,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 
 DOCS = Path(__file__).parents[1] / "docs"
-TITLES = ("forward, process s", "forward and gradient, process s", "peak above imports, MiB")
+TITLES = ("forward, s", "forward and gradient, s", "peak above imports, MiB")
 
 
 def main() -> None:

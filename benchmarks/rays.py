@@ -1,11 +1,11 @@
 """Rays through a volume, with the gradient to every voxel: torchdic against other ways to do the same.
 
-    python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 5] [--pause 10] [--ways Torchdic ...]
+    python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 5] [--pause 0] [--ways Torchdic ...]
 
-Each way of ray_rivals.py runs in processes of its own, in turn with the others, after a pause in seconds: what one
-process gives back, the next would otherwise find ready, of a virtual machine's host above all. A process's time is the
-least of three runs after a first one that compiles and warms up, by wall clock; the table has the processes' median,
-and in brackets their least and most. Memory is the peak of resident memory above what the imports take, likewise.
+Each way of ray_rivals.py runs in processes of its own, in turn with the others. After a pause a virtual machine's host
+has taken back the memory that one process left, and the next gets it anew, more slowly. A process's time is the least
+of three runs after a first one that compiles and warms up, by wall clock; the table has the processes' median, and in
+brackets their least and most. Memory is the peak of resident memory above what the imports take, likewise.
 Threads: OMP_NUM_THREADS, NUMBA_NUM_THREADS; JAX takes as many as the process may use (`taskset -c 0`). All solve the
 same ODE by as many Runge-Kutta steps of fourth order, through the same smooth random volume, from the same rays, in
 float32, and the table shows that they land alike (mean OPD in µm, and the gradient's absolute sum). A package that
@@ -45,7 +45,7 @@ def main() -> None:
     parser.add_argument("--voxels", type=int, nargs=3, default=(64, 256, 256))
     parser.add_argument("--steps", type=int, default=64)
     parser.add_argument("--repeats", type=int, default=5, help="processes of each way")
-    parser.add_argument("--pause", type=float, default=10, help="seconds before each process")
+    parser.add_argument("--pause", type=float, default=0, help="idle seconds before each process")
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
     parser.add_argument("--alone", choices=list(WAYS), help=argparse.SUPPRESS)
     arguments = parser.parse_args()

@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import time
+from typing import Literal
 
 WAYS = {
     "torch's own": {},
@@ -20,7 +21,8 @@ WAYS = {
     "asleep at once": {"OMP_WAIT_POLICY": "PASSIVE"},
     "one thread": {"OMP_NUM_THREADS": "1"},
 }
-PROPAGATIONS = ("projection", "rays", "wave")
+Propagation = Literal["projection", "rays", "wave"]
+PROPAGATIONS: tuple[Propagation, ...] = ("projection", "rays", "wave")
 
 
 def main() -> None:
@@ -39,9 +41,7 @@ def main() -> None:
         try:
             for way, variables in WAYS.items():
                 command = [sys.executable, __file__, *sys.argv[1:], "--alone"]
-                done = subprocess.run(
-                    command, check=True, stdout=subprocess.PIPE, text=True, env={**free, **variables}
-                )
+                done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env={**free, **variables})
                 cells = " | ".join(f"{s:.3f}" for s in json.loads(done.stdout))
                 print(f"| {'with one core taken' if busy else 'idle'} | {way} | {cells} |", flush=True)
         finally:
@@ -49,7 +49,7 @@ def main() -> None:
                 other.kill()
 
 
-def seconds(propagation: str, repeats: int) -> float:
+def seconds(propagation: Propagation, repeats: int) -> float:
     """Of an image of 20×64×64 voxels by 16 sources, at 7 planes behind 2 prisms, and its gradient."""
     import torch
 
