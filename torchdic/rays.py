@@ -138,7 +138,7 @@ def deviation(
     position, momentum = (v.movedim(-1, 0) for v in torch.broadcast_tensors(rays.position, rays.momentum))
     pz0 = axial_momentum(n0, rays.momentum).expand(momentum.shape[1:])
     straight = torch.cat((position, momentum / pz0, momentum, pz0[None]))
-    shape = straight.shape[1:]
+    shape = straight.shape[1:]  # laid out for the CPU's threads until the end
     straight = straight.reshape(7, shares(grid, shape.numel(), straight.device), -1)
 
     watched = 0
