@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 # Before torch, so that its idle threads (of GNU's OpenMP) spin for microseconds and then sleep. Spinning on, the
-# default, they wait for each other by the time slice wherever another program wants a core too: small arrays took up to
-# forty times as long. Asleep at once, they took up to three times as long where none does.
+# default, they wait for each other by the time slice wherever another program wants a core too; asleep at once, they
+# are woken at each operation, which takes longer than many of these (benchmarks/threads.py).
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.sampling import window
+from torchdic.scalar import number
 from torchdic.volume import Volume
 
 
@@ -76,7 +77,7 @@ def tubes_that_may_fold(
     a, b, c bound |H_px|, |H_pp|, |H_xx| slice by slice. With s = p/q that is q' = −a q − b p, p' = c q + a p, from
     q = 1, p = 0. While q > 0, S is finite and Q has an inverse: a thin lens is cleared up to its very focus.
     """
-    grid, n0 = volume.grid, float(volume.background)
+    grid, n0 = volume.grid, number(volume.background)
     field = (fields or volume.sampled(fidelity.interpolation))[0]
     slices = torch.stack([_bounds(s, grid) for s in field.unbind(0)]).to("cpu", torch.float64)
     faces = [grid.centre(0, i - 0.5) for i in range(grid.shape[0] + 1)]

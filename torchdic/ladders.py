@@ -195,9 +195,9 @@ def needed_padding(scene: Scene) -> int:
         return 0
     depths = [grid.centre(0, i) for i in spans[0]]
     distance = max(abs(number(z) - d) for z, d in itertools.product(acquisition.focus, depths))
-    n0 = float(volume.background)
+    n0 = number(volume.background)
     sine = min((n0 if microscope.objective is None else microscope.objective.na) / n0, 0.95)
-    shear = max((float(torch.as_tensor(p.shear).abs().max()) for p in acquisition.prisms if p is not None), default=0.0)
+    shear = max((abs(number(s)) for p in acquisition.prisms if p is not None for s in p.shear), default=0.0)
     reach = distance * sine / math.sqrt(1 - sine**2) + shear + BLUR * microscope.wavelength / (n0 * sine)
     beyond = max(reach / grid.spacing[a] - gap for a, gap in gaps.items())
     return min(max(0, math.ceil(beyond / 2)), max(grid.shape[1:]) // 2)

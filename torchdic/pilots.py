@@ -59,7 +59,7 @@ class Scene:
 
         The first has slabs half as deep as the objective's field or thinner.
         """
-        grid, n0, objective = self.volume.grid, float(self.volume.background), self.microscope.objective
+        grid, n0, objective = self.volume.grid, number(self.volume.background), self.microscope.objective
         na = n0 if objective is None else objective.na
         deepest = n0 * self.microscope.wavelength / (2 * na**2)
         steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
@@ -76,7 +76,7 @@ class Scene:
         """
         prisms = self.acquisition.prisms
         levels = [1.0 if p is None else math.sin(number(p.bias) / 2) ** 2 for p in prisms]
-        shears = [0.0 if p is None else float(torch.as_tensor(p.shear, dtype=torch.float64).norm()) for p in prisms]
+        shears = [0.0 if p is None else math.hypot(*map(number, p.shear)) for p in prisms]
         picked = {levels.index(min(levels)), levels.index(max(levels)), shears.index(max(shears)), len(prisms) - 1}
         depths = [number(z) for z in self.acquisition.focus]
         plane = self.volume.mean_plane()

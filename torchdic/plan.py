@@ -25,6 +25,7 @@ from torchdic.image_error import relative
 from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_apertures
 from torchdic.ladders import MARGIN, Choice, side_ladder, source_ladder, sparse, way_ladder
 from torchdic.pilots import Scene
+from torchdic.scalar import number
 from torchdic.volume import Volume
 from torchdic.wave import SlabWarning, UnstableError
 from torchdic.wrap_around import WrapAroundWarning
@@ -98,7 +99,7 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     """
     if not (isinstance(tolerance, int | float) and 0 < tolerance < math.inf):
         raise ValueError(f"tolerance {tolerance} must be above 0, and finite")
-    check_apertures(microscope, float(volume.background))
+    check_apertures(microscope, number(volume.background))
     started = time.perf_counter()
     scene = Scene(_detached(volume), microscope, acquisition)
     with warnings.catch_warnings():

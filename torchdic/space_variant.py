@@ -26,6 +26,7 @@ from torchdic.condenser import Condenser
 from torchdic.fidelity import Fidelity
 from torchdic.objective import Objective
 from torchdic.recompute import Demand
+from torchdic.scalar import number
 from torchdic.volume import Volume
 from torchdic.wave import exp_i, to_spectrum
 
@@ -88,7 +89,7 @@ def object_levels(
     is asin(NA_c/n0), a choice of where to look that carries no gradient. Raises ValueError for a cone without a
     condenser's aperture, and as `effective_defocus` and `levels` do.
     """
-    n0 = float(volume.background.detach())
+    n0 = number(volume.background)
     half_angle = None
     if fidelity.object_aberration == "cone":
         na = 0.0 if condenser is None else condenser.na

@@ -18,6 +18,7 @@ from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.rays import axial_momentum
 from torchdic.recompute import BatchWarning, Demand, replay, slabs
+from torchdic.scalar import number
 from torchdic.volume import Volume
 
 # Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
@@ -209,7 +210,7 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
     if most <= MOST_ENERGY and (least >= LEAST_ENERGY or not lossless):
         return
     low, high = (float(v) for v in torch.aminmax(volume.delta))
-    lowest, oblique = float(volume.background) + low, float(momentum.norm(dim=-1).max())
+    lowest, oblique = number(volume.background) + low, float(momentum.norm(dim=-1).max())
     thickness = volume.grid.extent[0] / steps
     if not math.isfinite(most) and lowest <= oblique:
         raise UnstableError(

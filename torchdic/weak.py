@@ -28,7 +28,7 @@ from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope, check_apertures
 from torchdic.prism import Prism
 from torchdic.recompute import sum_over_sources
-from torchdic.scalar import scalar
+from torchdic.scalar import number, scalar
 from torchdic.volume import Volume
 from torchdic.wave import LOWEST_PZ, axial_difference, exp_i, to_field, to_spectrum
 
@@ -160,7 +160,7 @@ def _kernel(
     device: torch.device,
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
-    check_apertures(microscope, float(background.detach()))
+    check_apertures(microscope, number(background))
     if microscope.vectorial:
         raise ValueError(
             "the linear transfer takes a prism's factor out of the sum over waves: it can't hold a polarisation pupil"
