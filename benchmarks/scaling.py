@@ -20,7 +20,7 @@ from thin_stack import timed
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Rays, Volume, image, trace
 
 STEPS = (16, 32, 64, 128, 256, 512)
-REPEATS = 3
+REPEATS = 5
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from torchdic import Fidelity, Trial
@@ -102,7 +103,14 @@ def _draw_panel(ax: Axes, trials: Sequence[Trial], cost: str, error: str) -> Non
             alpha=1 if i in front else 0.45,
         )
         if i in front:
-            ax.annotate(trial.name, (costs[i], errors[i]), (5, 4), textcoords="offset points", fontsize=6.5)
+            ax.annotate(
+                trial.name,
+                (costs[i], errors[i]),
+                (5, 4),
+                textcoords="offset points",
+                fontsize=6.5,
+                arrowprops={"arrowstyle": "-", "color": "0.5", "linewidth": 0.5, "shrinkA": 0, "shrinkB": 3},
+            )
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.margins(x=0.22, y=0.12)
@@ -117,15 +125,15 @@ def _keep_apart(ax: Axes) -> None:
     lines = [np.asarray(line.get_xydata()) for line in ax.lines]
     points = [ax.transData.transform(line[0]) for line in lines if len(line) == 1]
     taken = [Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in points]
-    for label in ax.texts:
+    for label in sorted(ax.texts, key=lambda text: text.xy[0]):  # pyright: ignore[reportAttributeAccessIssue]
         for dx, dy, align in PLACES:
             label.set_horizontalalignment(align)
             label.set_position((dx, dy))
-            box = label.get_window_extent(renderer)
+            box = Text.get_window_extent(label, renderer)  # without its line to the point
             inside = frame.x0 < box.x0 and box.x1 < frame.x1 and frame.y0 < box.y0 and box.y1 < frame.y1
             if inside and not any(box.overlaps(other) for other in taken):
                 break
-        taken.append(label.get_window_extent(renderer))
+        taken.append(Text.get_window_extent(label, renderer))
 
 
 def as_table(trials: Sequence[Trial]) -> str:
