@@ -34,6 +34,12 @@ def problem(interpolation="linear", absorbing=False, turn=False, seed=0):
     return equation, [straight, background, *fields]
 
 
+def at_first_face(equation):
+    """The state on the first face."""
+    components = 5 + (equation.absorption is not None) + equation.turn
+    return equation.straight.new_zeros(components, *equation.straight.shape[1:])
+
+
 def plain_slopes(equation, z, state):
     """The equation of torchdic.rays' docstring, for autograd."""
     y0, x0, vy, vx, py0, px0, pz0 = equation.straight
@@ -65,7 +71,7 @@ CASES = [
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_slopes_are_those_of_the_equation(case):
     equation, _ = problem(**case)
-    state = 0.01 * torch.randn_like(equation.start())
+    state = 0.01 * torch.randn_like(at_first_face(equation))
     with torch.no_grad():
         slopes = equation.slopes(equation.meet(0.3, state[:4]))
         torch.testing.assert_close(slopes, plain_slopes(equation, 0.3, state), rtol=0, atol=1e-14)
@@ -77,7 +83,7 @@ def test_gradient_in_everything_is_autograds_through_torchdiffeq(case, solver):
     """The tableau's adjoint, not an approximation: a wrong coefficient or order of stages shows at once."""
     equation, learned = problem(**case)
     depths = torch.tensor([-1.25, -0.7, 0.2, 1.0], dtype=torch.float64)
-    start = (0.01 * torch.randn_like(equation.start())).requires_grad_()
+    start = (0.01 * torch.randn_like(at_first_face(equation))).requires_grad_()
     weights = torch.randn_like(start)
     fidelity = Fidelity("rays", solver=solver, tolerance=1e-3, interpolation=equation.index.interpolation)
     end = solve(equation, start, depths, fidelity)
@@ -105,9 +111,9 @@ def test_backward_pass_keeps_where_a_step_began_and_what_it_sampled_and_nothing_
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        solve(equation, equation.start(), depths, Fidelity("rays"))
+        solve(equation, at_first_face(equation), depths, Fidelity("rays"))
     own = {t.untyped_storage().data_ptr() for t in equation.tensors}
-    value = equation.start()[0].nbytes
+    value = at_first_face(equation)[0].nbytes
     # δy, δx and their momenta; of 4 stages Δn with its gradient, and κ
     assert sum(size for pointer, size in kept.items() if pointer not in own) == 8 * (4 + 4 * 4) * value
 
@@ -126,9 +132,9 @@ def test_kept_by_rays_is_what_is_kept(solver, absorbing):
 
     fidelity = Fidelity("rays", solver=solver, steps=8)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        solve(equation, equation.start(), depths, fidelity)
+        solve(equation, at_first_face(equation), depths, fidelity)
     own = {t.untyped_storage().data_ptr() for t in equation.tensors}
-    values = sum(size for pointer, size in kept.items() if pointer not in own) / equation.start()[0].nbytes
+    values = sum(size for pointer, size in kept.items() if pointer not in own) / at_first_face(equation)[0].nbytes
     assert values == kept_by_rays(GRID, fidelity, absorbs=absorbing)
 
 
@@ -138,7 +144,7 @@ def test_nothing_is_kept_where_nothing_is_learned():
     straight, background = equation.straight.detach(), equation.background.detach()
     equation = dataclasses.replace(equation, straight=straight, background=background, index=index)
     depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
-    assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+    assert solve(equation, at_first_face(equation), depths, Fidelity("rays")).grad_fn is None
 
 
 def test_nothing_is_kept_without_gradients():
@@ -150,13 +156,13 @@ def test_nothing_is_kept_without_gradients():
         torch.no_grad(),
         mock.patch.object(torch.autograd.function.FunctionCtx, "save_for_backward", lambda _, *t: sizes.append(len(t))),
     ):
-        assert solve(equation, equation.start(), depths, Fidelity("rays")).grad_fn is None
+        assert solve(equation, at_first_face(equation), depths, Fidelity("rays")).grad_fn is None
     assert sizes == [len(equation.tensors)]
 
 
 def test_volume_changed_between_the_passes_is_an_error_not_a_wrong_gradient():
     equation, (_, _, field) = problem()
-    end = solve(equation, equation.start(), torch.tensor([-1.25, 1.25], dtype=torch.float64), Fidelity("rays"))
+    end = solve(equation, at_first_face(equation), torch.tensor([-1.25, 1.25], dtype=torch.float64), Fidelity("rays"))
     with torch.no_grad():
         field.add_(1)
     with pytest.raises(RuntimeError, match="modified inplace"):
@@ -168,7 +174,7 @@ def test_recomputed_gradient_is_the_kept_one():
     depths = torch.linspace(-1.25, 1.25, 5, dtype=torch.float64)
     kept, again = (
         torch.autograd.grad(
-            recompute(solve, equation, equation.start(), depths, Fidelity("rays"), when=when).sum(), learned
+            recompute(solve, equation, at_first_face(equation), depths, Fidelity("rays"), when=when).sum(), learned
         )
         for when in (False, True)
     )

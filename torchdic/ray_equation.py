@@ -50,11 +50,6 @@ class RayEquation:
     def _unperturbed(self) -> "_Unperturbed":
         return _Unperturbed(self.straight[:2], self.straight[2:4], self.straight[4:6], self.straight[6])
 
-    def start(self) -> Float[Tensor, "component *ray"]:
-        """The state on the first face."""
-        components = MOVING + 1 + (self.absorption is not None) + self.turn
-        return self.straight.new_zeros(components, *self.straight.shape[1:])
-
     def meet(self, z: float, moving: Float[Tensor, "4 *ray"]) -> "Met":
         """What rays meet at depth z."""
         y, x = self._positions(z, moving)
@@ -76,9 +71,9 @@ class RayEquation:
         path.addcmul_(dp_y, dp_y).addcmul_(dp_x, dp_x).addcmul_(q, q)
         return Met(moving, dp, index, kappa, delta + self.background, pz, pz.reciprocal(), q, path)
 
-    def moves(self, met: "Met") -> Float[Tensor, "4 *ray"]:
+    def moves(self, met: "Met", out: Float[Tensor, "4 *ray"] | None = None) -> Float[Tensor, "4 *ray"]:
         """The slopes of δy, δx, δp_y and δp_x."""
-        slopes = torch.empty_like(met.moving)
+        slopes = torch.empty_like(met.moving) if out is None else out
         of_place, of_momentum = slopes.split(2)
         torch.addcmul(met.dp, self._unperturbed.v, met.q, value=-1, out=of_place).mul_(met.r)
         torch.mul(met.sampled[1:], met.n * met.r, out=of_momentum)
@@ -86,23 +81,27 @@ class RayEquation:
 
     def slopes(self, met: "Met") -> Float[Tensor, "component *ray"]:
         """d(state)/dz."""
-        sums = [torch.mul(met.path, met.r).mul_(0.5)]
+        components = MOVING + 1 + (met.kappa is not None) + self.turn
+        slopes = met.n.new_empty(components, *met.n.shape)
+        self.moves(met, out=slopes[:MOVING])
+        sums = iter(slopes[MOVING:])
+        torch.mul(met.path, met.r, out=next(sums)).mul_(0.5)
         if met.kappa is not None:
-            sums.append((met.kappa * met.n).mul_(met.r))
+            torch.mul(met.kappa, met.n, out=next(sums)).mul_(met.r)
         if self.turn:
-            sums.append(self._swept(met).mul_(met.r))
-        return torch.cat((self.moves(met), torch.stack(sums)))
+            torch.mul(self._swept(met), met.r, out=next(sums))
+        return slopes
 
     def pull_back(self, z: float, met: "Met", moves_bar: Tensor, sums_bar: Tensor, h: float) -> "Pulled":
         """The loss's derivatives in what was met at depth z, from those in `moves` and, h times, in the sums.
 
-        A name that ends in _bar is the loss's derivative in that value.
+        A name that ends in _bar is the loss's derivative in that value. moves_bar is used up.
         """
         _, gy, gx = met.sampled.unbind()
         n, pz, r, q, dp, (_, v, p0, _) = met.n, met.pz, met.r, met.q, met.dp, self._unperturbed
         learned = self.straight.requires_grad
 
-        out = moves_bar * r
+        out = moves_bar.mul_(r)
         place_out, momentum_out = out.split(2)
         path_bar = torch.mul(sums_bar[0], r).mul_(h)
         index_bar = torch.empty_like(met.sampled)
@@ -113,27 +112,30 @@ class RayEquation:
         r_bar = (n * n_bar).addcmul_(met.path, path_bar, value=0.5).addcmul_(dp[0], y_out).addcmul_(dp[1], x_out)
         drift = (v[0] * y_out).addcmul_(v[1], x_out)
         r_bar.addcmul_(drift, q, value=-1)
-        q_bar = torch.addcmul(drift, q, path_bar, value=-1).neg_()
+        # of −q and −p_z
+        less_q_bar = drift.addcmul_(q, path_bar, value=-1)
         kappa_bar = None
         if met.kappa is not None:
             kappa_out = torch.mul(sums_bar[1], r).mul_(h)
             kappa_bar = n * kappa_out
             n_bar.addcmul_(met.kappa, kappa_out)
             r_bar.addcmul_(met.kappa, kappa_bar)
-        pz_bar = q_bar.clone() if learned else q_bar
-        p, p_bar = dp + p0, None
+        less_pz_bar = less_q_bar.clone() if learned else less_q_bar
+        p, turned_bar = dp + p0, None
         if self.turn:
             turn_bar = torch.mul(sums_bar[-1], r).mul_(h).div_(n + pz)
             swept = self._swept(met).mul_(turn_bar)
-            pz_bar.sub_(swept)
+            less_pz_bar.add_(swept)
             n_bar.sub_(swept)
             r_bar.addcmul_(swept, n + pz)
-            p_bar = torch.stack((-gx, gy)).mul_(turn_bar)
+            turned_bar = torch.stack((-gx, gy)).mul_(turn_bar)
             gradient_bar[0].addcmul_(p[1], turn_bar)
             gradient_bar[1].addcmul_(p[0], turn_bar, value=-1)
-        pz_bar.addcmul_(r_bar, r, value=-1).mul_(r)
-        n_bar.addcmul_(n, path_bar).addcmul_(n, pz_bar)
-        p_bar = p.mul_(pz_bar).neg_() if p_bar is None else p_bar.addcmul_(p, pz_bar, value=-1)
+        less_pz_bar.addcmul_(r_bar, r).mul_(r)
+        n_bar.addcmul_(n, path_bar).addcmul_(n, less_pz_bar, value=-1)
+        p_bar = p.mul_(less_pz_bar)
+        if turned_bar is not None:
+            p_bar.add_(turned_bar)
 
         y, x = self._positions(z, met.moving)
         place_bar, index_plane_bar = self.index.pull_back(z, y, x, index_bar)
@@ -149,7 +151,7 @@ class RayEquation:
         straight_bar = background_bar = None
         if learned:
             v_bar = torch.mul(place_bar, z - self.face).addcmul_(place_out, q, value=-1)
-            straight_bar = torch.cat((place_bar, v_bar, p_bar, -q_bar[None]))
+            straight_bar = torch.cat((place_bar, v_bar, p_bar, less_q_bar[None]))
         if self.background.requires_grad:
             background_bar = n_bar.sum() - self.background * path_bar.sum()
         return Pulled(moving_bar, straight_bar, background_bar, planes_bar)

@@ -150,7 +150,9 @@ class _EqualSteps(torch.autograd.Function):
                 pulled = equation.pull_back(stages[i], mets.pop(), slopes_bar, sums_bar, h * b[i])
                 gradients.add(stages[i], pulled)
                 stage_bars.append(pulled.moving)
-            moving_bar = sum(stage_bars[1:], moving_bar + stage_bars[0])
+            moving_bar = moving_bar + stage_bars[0]
+            for stage_bar in stage_bars[1:]:
+                moving_bar.add_(stage_bar)
         return (*[None] * 5, torch.cat((moving_bar, sums_bar)), *gradients.bars)
 
 
@@ -168,7 +170,8 @@ class _Evaluation(torch.autograd.Function):
         state, *tensors = ctx.saved_tensors
         equation, _ = make(tensors)
         gradients = _Gradients(equation)
-        pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), slopes_bar[:MOVING], slopes_bar[MOVING:], 1.0)
+        moves_bar, sums_bar = slopes_bar[:MOVING].clone(), slopes_bar[MOVING:]
+        pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), moves_bar, sums_bar, 1.0)
         gradients.add(z, pulled)
         return (None, None, torch.cat((pulled.moving, torch.zeros_like(state[MOVING:]))), *gradients.bars)
 
