@@ -154,4 +154,4 @@ def as_table(trials: Sequence[Trial]) -> str:
 
 
 def _digits(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}" if value < 100 else f"{value:.0f}"
+    return "" if value is None else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"

@@ -257,6 +257,12 @@ def test_ladder_climbs_from_projection_to_a_careful_wave_and_names_its_rungs():
         assert best.padding >= fidelity.padding
 
 
+def test_ladder_pads_no_specimen_that_reaches_the_sides():
+    rungs = ladder(GRID, padded=False)
+    assert {rung.fidelity.padding for rung in rungs} == {0}
+    assert len({rung.label for rung in rungs}) == len(rungs) == len(ladder(GRID)) - 1
+
+
 def test_label_says_what_is_not_a_default():
     fidelity = Fidelity("wave", steps=16, sources=12, order=1)
     assert Candidate(fidelity).label == "wave 12, 16 steps, order 1"

@@ -101,7 +101,7 @@ class Fidelity:
 # Errors of images (torchdic.image_error) on the scenes of `python benchmarks/accuracy.py`: a thin weak bead, a cell, a
 # thick graded ball and a sharp strong bead, as tests/test_precision.py holds them.
 DRAFT = Fidelity("wave", sources=12, order=1)
-"""A quick look, at about the price of a projection: 0.037, 0.20, 0.039 and 0.31 off."""
+"""A quick look, at up to twice the price of a projection: 0.037, 0.20, 0.039 and 0.31 off."""
 STANDARD = Fidelity("wave")
 """The default: 0.019, 0.084, 0.036 and 0.071 off; 8 voxels of padding bring the cell to 0.035, the ball to 0.0037."""
 REFERENCE = Fidelity("wave", sources=120, interpolation="cubic", padding=16)

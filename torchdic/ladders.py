@@ -13,12 +13,15 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
-from torchdic.cost import SLAB
+from torchdic.cost import SLAB, directions
 from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
 from torchdic.image_error import relative
+from torchdic.instrument import Microscope
 from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
 from torchdic.rays import TurnedRaysError
 from torchdic.scalar import number
+from torchdic.volume import Volume
 from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
@@ -77,11 +80,28 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         if counts[n - 2] > 1:
             fall = min(math.sqrt(fall * change / max(before, 1e-300)), 0.9)
         # errors of two numbers have little in common, so that their squares add up to the change's
-        beyond = change * fall / math.hypot(1, fall)
+        beyond = math.hypot(change * fall / math.hypot(1, fall), _cut(pilot.microscope, count, images[-1]))
         if beyond <= MARGIN / 2 * tolerance:
             break
     seen = zip(counts, images, strict=False)
-    return [Choice(replace(coarse, sources=count), i - images[-1], beyond) for count, i in seen], images[-1]
+    return [
+        Choice(replace(coarse, sources=count), i - images[-1], math.hypot(beyond, _cut(pilot.microscope, count, i)))
+        for count, i in seen
+    ], images[-1]
+
+
+def _cut(microscope: Microscope, sources: int, images: Tensor) -> float:
+    """The error of a condenser's direct light that the pupil's edge divides: a direction passes as a whole or not."""
+    condenser, objective = microscope.condenser, microscope.objective
+    assert condenser is not None
+    if objective is None or condenser.na <= objective.na:
+        return 0.0
+    inner, edge = condenser.inner_na or 0.0, objective.na
+    passes = (edge**2 - min(inner, edge) ** 2) / (condenser.na**2 - inner**2)
+    points, weights = condenser.sources(sources, dtype=torch.float64)
+    passed = float((weights * (points.norm(dim=-1) <= edge)).sum() / weights.sum())
+    level = images.mean((2, 3), keepdim=True) / passed if passed > 0 else torch.ones_like(images[..., :1, :1])
+    return relative((passed - passes) * level, images)
 
 
 def sparse(pilot: Scene, counts: list[Choice], dense: Tensor) -> Scene:
@@ -163,8 +183,9 @@ def side_ladder(scene: Scene, coarse: Fidelity, tolerance: float) -> list[Side]:
     narrower = [lost(0)]
     if narrower[0].error(1) > MARGIN / 4 * tolerance and half < width:  # or none is needed
         narrower.append(lost(half))
-    # the blur's tail falls off slowly: so much lies beyond the widest
-    steady, fringes = narrower[-1].steady / 3, narrower[-1].fringes / 3
+    # the blur's tail falls off slowly: so much lies beyond the widest, and more where no sources average its rings
+    part = 3 if len(parts) > 1 and directions(scene.microscope, AT_SIDES) >= AT_SIDES else 1
+    steady, fringes = narrower[-1].steady / part, narrower[-1].fringes / part
     return [*(Side(s.padding, s.steady + steady, s.fringes + fringes) for s in narrower), Side(width, steady, fringes)]
 
 
@@ -179,25 +200,42 @@ def _fast(padding: int, shape: tuple[int, ...]) -> int:
 def needed_padding(scene: Scene) -> int:
     """Voxels on each side beyond which no recorded light comes back; 0 where the specimen reaches a side."""
     volume, microscope, acquisition = scene.volume, scene.microscope, scene.acquisition
-    grid, strength = volume.grid, volume.delta.abs()
-    if volume.absorption is not None:
-        strength = strength + volume.absorption
-    there = strength > 1e-3 * strength.max()
-    if not bool(there.any()):
+    grid, filled = volume.grid, spans(volume)
+    if filled is None or min(gaps := _gaps(grid, filled)) == 0:
         return 0
-    spans = []
-    for axis in range(3):
-        filled = there.any(dim=tuple(a for a in range(3) if a != axis)).nonzero()
-        spans.append((int(filled[0]), int(filled[-1])))
-    # across one voxel there is nowhere to go
-    gaps = {a: min(spans[a][0], grid.shape[a] - 1 - spans[a][1]) for a in (1, 2) if grid.shape[a] > 1}
-    if not gaps or min(gaps.values()) == 0:
-        return 0
-    depths = [grid.centre(0, i) for i in spans[0]]
+    depths = [grid.centre(0, i) for i in filled[0]]
     distance = max(abs(number(z) - d) for z, d in itertools.product(acquisition.focus, depths))
     n0 = number(volume.background)
     sine = min((n0 if microscope.objective is None else microscope.objective.na) / n0, 0.95)
     shear = max((abs(number(s)) for p in acquisition.prisms if p is not None for s in p.shear), default=0.0)
     reach = distance * sine / math.sqrt(1 - sine**2) + shear + BLUR * microscope.wavelength / (n0 * sine)
-    beyond = max(reach / grid.spacing[a] - gap for a, gap in gaps.items())
+    beyond = max(reach / grid.spacing[a] - gap for a, gap in zip((1, 2), gaps, strict=True))
     return min(max(0, math.ceil(beyond / 2)), max(grid.shape[1:]) // 2)
+
+
+Spans = list[tuple[int, int]]
+
+
+def spans(volume: Volume) -> Spans | None:
+    """The first and last voxel along z, y and x of what is in a volume; None of an empty one."""
+    strength = volume.delta.abs()
+    if volume.absorption is not None:
+        strength = strength + volume.absorption
+    there = strength > 1e-3 * strength.max()
+    if not bool(there.any()):
+        return None
+    found = []
+    for axis in range(3):
+        filled = there.any(dim=tuple(a for a in range(3) if a != axis)).nonzero()
+        found.append((int(filled[0]), int(filled[-1])))
+    return found
+
+
+def reaches_a_side(volume: Volume) -> bool:
+    """Whether there is something in the outermost voxels along y or x, so that a padded array is another scene."""
+    filled = spans(volume)
+    return filled is not None and min(_gaps(volume.grid, filled)) == 0
+
+
+def _gaps(grid: Grid, filled: Spans) -> list[int]:
+    return [min(filled[a][0], grid.shape[a] - 1 - filled[a][1]) for a in (1, 2)]

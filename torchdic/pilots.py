@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchdic.condenser import Condenser
@@ -138,18 +137,19 @@ class Scene:
         if size == list(shape[1:]):
             return self
         strength = volume.delta if volume.absorption is None else volume.delta.abs() + volume.absorption
-        busy = 1e-6 * strength.square()
+        busy = 1e-6 * strength.square().sum(0)
         for axis in (1, 2):
-            if shape[axis] > 1:
-                busy = busy + torch.gradient(strength, dim=axis)[0].square()
-        # one axis after the other: a square window costs its area at each place
-        rows = F.avg_pool2d(busy.sum(0)[None, None], (size[0], 1), stride=1)
-        sums = F.avg_pool2d(rows, (1, size[1]), stride=1)[0, 0]
-        row, column = divmod(int(sums.argmax()), sums.shape[1])
+            busy = busy + (strength.roll(-1, axis) - strength.roll(1, axis)).square().sum(0) / 4
         fade = _fade(size, shape[1:]).to(strength)
+        weight = torch.zeros_like(busy)
+        weight[: size[0], : size[1]] = fade.square()
+        # the array is periodic: a window may lie across its sides, where a specimen that reaches them has an edge
+        sums = torch.fft.irfft2(torch.fft.rfft2(busy) * torch.fft.rfft2(weight).conj(), s=shape[1:])
+        rows, columns = (n if length < n else 1 for length, n in zip(size, shape[1:], strict=True))
+        row, column = divmod(int(sums[:rows, :columns].argmax()), columns)
 
         def cut(part: Tensor) -> Tensor:
-            inside = part[:, row : row + size[0], column : column + size[1]]
+            inside = part.roll((-row, -column), (1, 2))[:, : size[0], : size[1]]
             sides = inside[:, :1], inside[:, -1:], inside[:, :, :1], inside[:, :, -1:]
             rim = torch.cat([side.flatten(1) for side in sides], 1).mean(1)[:, None, None]
             return rim + (inside - rim) * fade

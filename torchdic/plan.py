@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any
 
 import torch
@@ -22,7 +23,7 @@ from torchdic.cost import directions, seconds, work
 from torchdic.effects import Climbed, Effect, counted, effects
 from torchdic.fidelity import Fidelity
 from torchdic.image_error import relative
-from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_apertures
+from torchdic.instrument import Acquisition, Microscope, SamplingWarning, check_apertures, check_sampling
 from torchdic.ladders import MARGIN, Choice, side_ladder, source_ladder, sparse, way_ladder
 from torchdic.pilots import Scene
 from torchdic.scalar import number
@@ -58,7 +59,7 @@ class Plan:
             error = "—" if e.basis == "absent" else f"{'≤ ' if e.basis == 'bound' else ''}{e.error:.2g}"
             known = e.basis + (f": {e.note}" if e.note else "")
             lines.append(f"{e.name:<18}{'yes' if e.needed else 'no':<8}{error:>14}{e.cost:>7.0%}  {known}")
-        verdict = "meets" if self.met else "misses"
+        verdict = "meets" if self.met else "misses" if self.error > self.tolerance else "too near to be sure of"
         return "\n".join(
             [
                 *lines,
@@ -92,14 +93,16 @@ def describe(fidelity: Fidelity) -> str:
 def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
     """The cheapest Fidelity whose images err by at most `tolerance`, and what each effect is worth.
 
-    The error is that of `torchdic.image_error`. Where the specimen stays clear of the sides the truth is the specimen
-    alone in its medium; where it reaches them, the periodic array that `image` computes without padding. Nothing in it
-    is random, and no choice hangs on a clock. Raises ValueError for a tolerance that isn't positive, and as `image`
-    does. Warns ToleranceWarning where no fidelity meets the tolerance: the plan is then the best one found.
+    The error is that of `torchdic.image_error`, against the wave on the same voxels: what voxels too coarse for the
+    specimen lose is not in it. Where the specimen stays clear of the sides the truth is the specimen alone in its
+    medium; where it reaches them, the periodic array that `image` computes without padding. Nothing in it is random,
+    and no choice hangs on a clock. Raises ValueError for a tolerance that isn't positive, and as `image` does. Warns
+    ToleranceWarning where no fidelity is sure to meet the tolerance: the plan is then the best one found.
     """
-    if not (isinstance(tolerance, int | float) and 0 < tolerance < math.inf):
+    if not (isinstance(tolerance, Real) and 0 < tolerance < math.inf):
         raise ValueError(f"tolerance {tolerance} must be above 0, and finite")
     check_apertures(microscope, number(volume.background))
+    check_sampling(microscope, volume.grid)
     started = time.perf_counter()
     scene = Scene(_detached(volume), microscope, acquisition)
     with warnings.catch_warnings():
@@ -110,7 +113,8 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     if not chosen.met:
         worst = max(chosen.effects, key=lambda e: e.error)
         warnings.warn(
-            f"no fidelity tried meets the tolerance {tolerance:g}: the best errs by about {chosen.error:.2g} "
+            f"no fidelity tried is sure to meet the tolerance {tolerance:g}, which takes a predicted error of "
+            f"{MARGIN * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
             f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for {chosen.error / MARGIN:.2g}, or take "
             "finer voxels, a narrower condenser or wider sides",
             ToleranceWarning,

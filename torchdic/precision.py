@@ -187,10 +187,13 @@ def pareto_front(costs: Sequence[float | None], errors: Sequence[float | None]) 
     return front
 
 
-def ladder(grid: Grid) -> list[Candidate]:
-    """Candidates from the cheapest way to the most careful one, for a volume of so many slices."""
-    slices, margin = grid.shape[0], max(grid.shape[1:]) // 8
-    return [
+def ladder(grid: Grid, *, padded: bool = True) -> list[Candidate]:
+    """Candidates from the cheapest way to the most careful one, for a volume of so many slices.
+
+    padded: whether to try padding, which makes another scene of a specimen that reaches the sides.
+    """
+    slices, margin = grid.shape[0], max(grid.shape[1:]) // 8 if padded else 0
+    rungs = [
         Candidate(Fidelity("projection", sources=12)),
         Candidate(Fidelity("projection")),
         Candidate(Fidelity("rays", sources=12, steps=max(1, slices // 4))),
@@ -207,6 +210,7 @@ def ladder(grid: Grid) -> list[Candidate]:
         Candidate(Fidelity("wave", sources=80)),
         Candidate(Fidelity("wave", steps=2 * slices, sources=80, padding=margin)),
     ]
+    return list(dict.fromkeys(rungs))  # without padding two are alike
 
 
 def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> dict[Propagation, Fidelity]:
