@@ -512,6 +512,13 @@ def test_an_edge_across_the_sides_of_a_wide_array_is_seen(tolerance):
     assert tolerance / 10 < found.error <= tolerance
 
 
+def test_pixels_wider_than_a_pilots_window_are_planned_for():
+    grid = Grid((4, 100, 100), (0.4, 0.2, 0.2))
+    ball = volume(GaussianBall(0.8, 0.01, 1.36).delta(grid), grid)
+    microscope = replace(MICROSCOPE, camera=Camera(pixel_size=13.0))
+    assert by_name(plan(ball, microscope, Acquisition([SHEARED]), 0.1))["camera"].basis == "pilot"
+
+
 def test_coherent_light_keeps_its_rings_far_beyond_the_sides():
     grid = Grid((8, 40, 44), (0.4, 0.2, 0.2))
     ball = volume(GaussianBall(0.8, 0.02, 1.36).delta(grid), grid)

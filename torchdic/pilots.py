@@ -129,11 +129,13 @@ class Scene:
         """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.
 
         Towards its own sides it fades into the mean along them, so that layers get no edges. An axis up to a quarter as
-        long again is kept whole.
+        long again is kept whole. Two of a camera's pixels fit in.
         """
-        volume = self.volume
-        shape = volume.grid.shape
-        size = [n if n <= 1.25 * side else side for n in shape[1:]]
+        volume, camera = self.volume, self.microscope.camera
+        shape, (dy, dx) = volume.grid.shape, volume.grid.spacing[1:]
+        pixel = (dy, dx) if camera is None else camera.pixel_spacing((dy, dx))
+        sides = [max(side, math.ceil(2 * p / d)) for p, d in zip(pixel, (dy, dx), strict=True)]
+        size = [n if n <= 1.25 * most else most for n, most in zip(shape[1:], sides, strict=True)]
         if size == list(shape[1:]):
             return self
         strength = volume.delta if volume.absorption is None else volume.delta.abs() + volume.absorption
@@ -150,8 +152,8 @@ class Scene:
 
         def cut(part: Tensor) -> Tensor:
             inside = part.roll((-row, -column), (1, 2))[:, : size[0], : size[1]]
-            sides = inside[:, :1], inside[:, -1:], inside[:, :, :1], inside[:, :, -1:]
-            rim = torch.cat([side.flatten(1) for side in sides], 1).mean(1)[:, None, None]
+            edges = inside[:, :1], inside[:, -1:], inside[:, :, :1], inside[:, :, -1:]
+            rim = torch.cat([edge.flatten(1) for edge in edges], 1).mean(1)[:, None, None]
             return rim + (inside - rim) * fade
 
         delta, absorption = (None if part is None else cut(part) for part in (volume.delta, volume.absorption))
