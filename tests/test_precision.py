@@ -255,6 +255,9 @@ def test_ladder_climbs_from_projection_to_a_careful_wave_and_names_its_rungs():
         assert best.steps >= 2 * (fidelity.steps or 6)
         assert best.sources > fidelity.sources
         assert best.padding >= fidelity.padding
+        points, _ = Condenser(0.5).sources(best.sources, dtype=torch.float64)
+        assert len(points) == best.sources
+        assert float(torch.cdist(points, -points).min(1).values.max()) < 1e-6  # from opposite sides alike
 
 
 def test_ladder_pads_no_specimen_that_reaches_the_sides():

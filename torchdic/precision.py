@@ -9,6 +9,7 @@ an exact field's images where they are given, otherwise the converged wave; of g
 Voxels are taken as they are: what finer ones would change is part of the model's error where the truth is exact.
 """
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -216,6 +217,7 @@ def ladder(grid: Grid, *, padded: bool = True) -> list[Candidate]:
 def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> dict[Propagation, Fidelity]:
     """For each propagation numbers finer than its candidates': twice the steps, half as many sources again, splines.
 
+    Sources are K rings of 2K: the same from opposite sides, which weak phase in bright field lives by.
     The padding is that of all candidates' widest. The wave's error at half the reference's steps is 4/3 of what a trial
     shows, for it falls with their square.
     """
@@ -225,7 +227,7 @@ def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid)
     for propagation in dict.fromkeys(used):
         own = [f for f in given if f.propagation == propagation] or given
         steps = 2 * max(f.steps or grid.shape[0] for f in own)
-        sources = -(-3 * max(f.sources for f in own) // 2)
+        sources = 2 * math.ceil(math.sqrt(0.75 * max(f.sources for f in own))) ** 2
         margin = max(f.padding for f in given)
         found[propagation] = Fidelity(propagation, steps, sources, "cubic", padding=margin)
     return found

@@ -101,10 +101,10 @@ class _EqualSteps(torch.autograd.Function):
         evaluations = count()
 
         def slopes(z: float, state: Tensor) -> Tensor:
-            met = equation.meet(z, state[:MOVING])
             step, stage = divmod(next(evaluations), stages)
             if stage == 0 and step > 0:  # a step begins where the last one has ended
-                watch(step - 1, met.moving)
+                watch(step - 1, state[:MOVING])
+            met = equation.meet(z, state[:MOVING])
             if keep:
                 if stage == 0:
                     kept.append(met.moving.clone())  # without the sums beside it
