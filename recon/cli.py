@@ -200,13 +200,13 @@ def _work_precision(options: argparse.Namespace) -> None:
     config = load(options.config)
     specimen = _specimen(config, str(options.config))
     grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
+    if config.simulation.exact and not hasattr(specimen, "field"):
+        raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     volume = _volume(specimen, grid, options.device)
     candidates = config.candidates or ladder(grid, padded=not reaches_a_side(volume))
     reference: dict[Propagation, Fidelity] = converged_fidelities(candidates, grid)
     if (given := config.work_precision.reference) is not None:
         reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
-    if config.simulation.exact and not hasattr(specimen, "field"):
-        raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     prepare_folder(options.out)
     exact = None
     if hasattr(specimen, "field"):

@@ -69,9 +69,11 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         return [], pilot(coarse)
     counts = [n for n in COUNTS if condenser.inner_na is None or n > 1]
     images: list[Tensor] = []
+    cuts: list[float] = []
     beyond = 0.0
     for n, count in enumerate(counts):
         images.append(pilot(replace(coarse, sources=count)))
+        cuts.append(_cut(pilot.microscope, count, images[-1]))
         if count < 18 or n < 2:
             continue  # fewer may agree by chance
         change, before = (relative(images[i] - images[i - 1], images[-1]) for i in (n, n - 1))
@@ -80,14 +82,12 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         if counts[n - 2] > 1:
             fall = min(math.sqrt(fall * change / max(before, 1e-300)), 0.9)
         # errors of two numbers have little in common, so that their squares add up to the change's
-        beyond = math.hypot(change * fall / math.hypot(1, fall), _cut(pilot.microscope, count, images[-1]))
+        beyond = math.hypot(change * fall / math.hypot(1, fall), cuts[-1])
         if beyond <= MARGIN / 2 * tolerance:
             break
-    seen = zip(counts, images, strict=False)
-    return [
-        Choice(replace(coarse, sources=count), i - images[-1], math.hypot(beyond, _cut(pilot.microscope, count, i)))
-        for count, i in seen
-    ], images[-1]
+    seen = zip(counts, images, cuts, strict=False)
+    choices = [Choice(replace(coarse, sources=n), i - images[-1], math.hypot(beyond, cut)) for n, i, cut in seen]
+    return choices, images[-1]
 
 
 def _cut(microscope: Microscope, sources: int, images: Tensor) -> float:
@@ -99,7 +99,7 @@ def _cut(microscope: Microscope, sources: int, images: Tensor) -> float:
     inner, edge = condenser.inner_na or 0.0, objective.na
     passes = (edge**2 - min(inner, edge) ** 2) / (condenser.na**2 - inner**2)
     points, weights = condenser.sources(sources, dtype=torch.float64)
-    passed = float((weights * (points.norm(dim=-1) <= edge)).sum() / weights.sum())
+    passed = float((weights * (points.norm(dim=-1) <= edge)).sum())
     level = images.mean((2, 3), keepdim=True) / passed if passed > 0 else torch.ones_like(images[..., :1, :1])
     return relative((passed - passes) * level, images)
 
@@ -200,7 +200,7 @@ def _fast(padding: int, shape: tuple[int, ...]) -> int:
 def needed_padding(scene: Scene) -> int:
     """Voxels on each side beyond which no recorded light comes back; 0 where the specimen reaches a side."""
     volume, microscope, acquisition = scene.volume, scene.microscope, scene.acquisition
-    grid, filled = volume.grid, spans(volume)
+    grid, filled = volume.grid, _spans(volume)
     if filled is None or min(gaps := _gaps(grid, filled)) == 0:
         return 0
     depths = [grid.centre(0, i) for i in filled[0]]
@@ -213,10 +213,13 @@ def needed_padding(scene: Scene) -> int:
     return min(max(0, math.ceil(beyond / 2)), max(grid.shape[1:]) // 2)
 
 
-Spans = list[tuple[int, int]]
+def reaches_a_side(volume: Volume) -> bool:
+    """Whether there is something in the outermost voxels along y or x, so that a padded array is another scene."""
+    filled = _spans(volume)
+    return filled is not None and min(_gaps(volume.grid, filled)) == 0
 
 
-def spans(volume: Volume) -> Spans | None:
+def _spans(volume: Volume) -> list[tuple[int, int]] | None:
     """The first and last voxel along z, y and x of what is in a volume; None of an empty one."""
     strength = volume.delta.abs()
     if volume.absorption is not None:
@@ -231,11 +234,6 @@ def spans(volume: Volume) -> Spans | None:
     return found
 
 
-def reaches_a_side(volume: Volume) -> bool:
-    """Whether there is something in the outermost voxels along y or x, so that a padded array is another scene."""
-    filled = spans(volume)
-    return filled is not None and min(_gaps(volume.grid, filled)) == 0
-
-
-def _gaps(grid: Grid, filled: Spans) -> list[int]:
+def _gaps(grid: Grid, filled: list[tuple[int, int]]) -> list[int]:
+    """Empty voxels between what is in a volume and its nearer side, along y and x."""
     return [min(filled[a][0], grid.shape[a] - 1 - filled[a][1]) for a in (1, 2)]
