@@ -72,7 +72,7 @@ def textbook_images(volume: Volume, scene: Scene, padding: int, steps: int) -> T
     """Images of the textbook's split step: its field, taken back to z = 0 in the background, as a transmission."""
     grid = replace(volume.grid, shape=(volume.grid.shape[0], *(n + 2 * padding for n in volume.grid.shape[1:])))
     wide = Volume(grid, torch.nn.functional.pad(volume.delta, (padding,) * 4), volume.background)
-    momentum, _ = scene.microscope.sources(Fidelity("wave"), dtype=wide.delta.dtype, device=wide.delta.device)
+    momentum, _ = scene.microscope.sources(Fidelity("wave").sources, dtype=wide.delta.dtype, device=wide.delta.device)
     spectrum = textbook_screen(wide, scene.microscope.wavelength, momentum, steps)
     difference, _ = axial_difference(grid, scene.microscope.wavelength, wide.background, momentum)
     k0 = 2 * math.pi / scene.microscope.wavelength
@@ -107,7 +107,7 @@ def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMet
     assert microscope.condenser is not None
     assert microscope.objective is not None
     plane, n0 = volume.mean_plane(), volume.background
-    momentum, weights = microscope.sources(rays, dtype=torch.float32, device=volume.delta.device)
+    momentum, weights = microscope.sources(rays.sources, dtype=torch.float32, device=volume.delta.device)
     half_angle = math.asin(microscope.condenser.na / float(n0)) if method == "cone" else None
     careful = Fidelity("rays", interpolation="cubic", steps=rays.steps)
     field = project if rays.propagation == "projection" else landing.ray_field

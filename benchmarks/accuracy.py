@@ -92,9 +92,9 @@ def measure(scene: Scene, repeats: int, tried: list[Candidate]) -> Iterator[Tria
     # rays and float32 are held short: their converged answers err by far less than the trials
     slices, margin = scene.grid.shape[0], REFERENCE.padding
     references: dict[Propagation, Fidelity] = {
-        "projection": Fidelity("projection", sources=150, padding=margin),
+        "projection": Fidelity("projection", sources=200, padding=margin),
         "rays": Fidelity("rays", slices // 2, 48, padding=margin // 2),
-        "wave": Fidelity("wave", scene.finest * slices, 150, padding=margin),
+        "wave": Fidelity("wave", scene.finest * slices, 200, padding=margin),
     }
     exact = None
     if isinstance(scene.specimen, ExactSpecimen):

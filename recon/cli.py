@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
@@ -152,7 +153,7 @@ def _simulate(options: argparse.Namespace) -> None:
             prepare_folder(options.out)
             if config.tolerance is not None:
                 planned = plan(volume, microscope, acquisition, config.tolerance)
-                print(announce(planned), flush=True)
+                print(f"{announce(planned)}, {planned.seconds:.2g} s", flush=True)
                 fidelity = planned.fidelity
                 write_json(options.out / "plan.json", planned.as_dict())
                 resolved = replace(config, fidelity=fidelity, tolerance=None)
@@ -269,6 +270,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="torchdic",
         description="Simulate DIC images, and reconstruct the refractive-index volume behind them.",
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('torchdic')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     out = _Parser(add_help=False)
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")

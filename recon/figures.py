@@ -117,10 +117,10 @@ def draw_stack(
     focus: Sequence[float | Tensor],
     spacing: tuple[float, float],
 ) -> Figure:
-    """A stack's images, a row for each prism; at most seven focus planes, evenly chosen."""
+    """A stack's images, a row for each prism on one scale of grey; at most seven focus planes, evenly chosen."""
     planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), 7)).round().astype(int))
     aspect = stack.shape[2] * spacing[0] / (stack.shape[3] * spacing[1])
-    figure = Figure(figsize=(1.9 * len(planes) + 0.6, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
+    figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
     for p, prism in enumerate(prisms):
         limits = float(stack[p].min()), float(stack[p].max())
@@ -128,6 +128,9 @@ def draw_stack(
             _show(ax, stack[p, f], spacing, "gray", limits)
             if p == 0:
                 ax.set_title(f"focus {float(focus[f]):g} µm", fontsize=8)
+        bar = figure.colorbar(axes[p, 0].images[0], ax=axes[p].tolist(), pad=0.01, aspect=12)
+        bar.set_label("intensity", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
         _scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
     return figure

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
 from torchdic import Fidelity, Trial
@@ -22,6 +23,8 @@ from torchdic.precision import pareto_front
 
 COLOURS = {"projection": "tab:blue", "rays": "tab:orange", "wave": "tab:green"}
 MARKERS = {"projection": "s", "rays": "^", "wave": "o"}
+# Opacity of a candidate that another one beats.
+PALE = 0.45
 # Errors below this, those of the converged answer itself among them, are drawn here.
 LEAST = 1e-7
 # Places of a label in points from its point, near ones first.
@@ -59,7 +62,8 @@ def as_dict(trials: Sequence[Trial], reference: Mapping[Propagation, Fidelity]) 
 def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str] = ("image", "gradient")) -> Figure:
     """Error against seconds, log-log: a row for each scene and quantity, columns for numerical and model error.
 
-    The Pareto front is a line, and its points carry their names; crosses are candidates in float64.
+    The Pareto front is a line, and its points carry their names; candidates that another one beats are pale, those in
+    float64 crosses.
     """
     rows = [(scene, quantity) for scene in scenes for quantity in quantities]
     figure = Figure(figsize=(10, 0.4 + 3.1 * len(rows)), layout="constrained")
@@ -77,7 +81,11 @@ def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str]
     handles = [
         grid[0, 0].plot([], [], MARKERS[name], color=COLOURS[name], label=name)[0] for name in COLOURS if name in shown
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8, frameon=False)
+    plot = grid[0, 0].plot
+    handles += plot([], [], "x", color="0.3", label="float64")
+    handles += plot([], [], "o", color="0.3", alpha=PALE, markersize=4, label="beaten by another")
+    handles += plot([], [], color="0.6", linewidth=1, label="Pareto front")
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
     figure.draw_without_rendering()  # lays the axes out
     figure.set_layout_engine("none")
     for axes in grid.flat:
@@ -100,7 +108,7 @@ def _draw_panel(ax: Axes, trials: Sequence[Trial], cost: str, error: str) -> Non
             "x" if double else MARKERS[propagation],
             color=COLOURS[propagation],
             markersize=6 if i in front else 4,
-            alpha=1 if i in front else 0.45,
+            alpha=1 if i in front else PALE,
         )
         if i in front:
             ax.annotate(
@@ -113,6 +121,10 @@ def _draw_panel(ax: Axes, trials: Sequence[Trial], cost: str, error: str) -> Non
             )
     ax.set_xscale("log")
     ax.set_yscale("log")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_minor_locator(LogLocator(subs=(2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("{x:g}")
     ax.margins(x=0.22, y=0.12)
     ax.tick_params(which="both", labelsize=7)
     ax.grid(alpha=0.25)

@@ -63,15 +63,17 @@ def prepare(
     scale: float | str | None = None,
     offset: float = 0.0,
     order: int = 2,
+    empty: Sequence[float] | None = None,
 ) -> Measured:
     """Check a stack against the acquisition and bring it to the model's unit, the empty bright field.
 
     biases: one per prism, rad; None is bright field. focus: one per plane, µm. pixel_size: (y, x) in µm,
     which wins over the file's; None takes the file's. pixels: (y, x) of the model, checked where given.
     flatten: divide by the slow background, a polynomial surface of total degree `order`, one per prism; an
-    extinct prism's background (sin²(bias/2) below 1e-3) is stray light and is subtracted instead.
+    extinct prism's background (`empty` below 1e-3) is stray light and is subtracted instead.
     scale: the file's unit per empty bright field, or "background" for what takes the empty field to
-    sin²(bias/2), in bright field to 1. offset: the camera's dark counts in the file's unit, subtracted first.
+    `empty`. offset: the camera's dark counts in the file's unit, subtracted first. empty: the empty field's
+    intensity behind each prism; None is that of ideal polarisers, sin²(bias/2), and in bright field 1.
     By default integers are flattened and scaled by their background; floats count as relative to the empty
     bright field and are left alone.
     Raises StackError where prisms, planes or pixels are not as many as said, no pixel size is known, an
@@ -89,19 +91,21 @@ def prepare(
         flatten = stack.is_integer
     if scale is None:
         scale = "background" if stack.is_integer else 1.0
+    levels = [_ideal_empty_field(bias) for bias in biases] if empty is None else empty
     prepared = [
-        _in_model_unit(images, bias, flatten, scale, offset, order, f"{stack.source}: prism {prism}")
-        for prism, (images, bias) in enumerate(zip(stack.data, biases, strict=True))
+        _in_model_unit(images, bias, level, flatten, scale, offset, order, f"{stack.source}: prism {prism}")
+        for prism, (images, bias, level) in enumerate(zip(stack.data, biases, levels, strict=True))
     ]
     reports = tuple(report for _, report in prepared)
     if not stack.is_integer:
-        _check_brightness(stack, reports)
+        _check_brightness(stack, reports, levels)
     return Measured(np.stack([images for images, _ in prepared]), focus, pixel_size, reports)
 
 
 def _in_model_unit(
     images: Real[np.ndarray, "focus y x"],
     bias: float | None,
+    expected: float,
     flatten: bool,
     scale: float | str,
     offset: float,
@@ -109,11 +113,11 @@ def _in_model_unit(
     label: str,
 ) -> tuple[Float[np.ndarray, "focus y x"], PrismReport]:
     """One prism's images relative to the empty bright field, float32."""
-    expected = _empty_field(bias)
     extinct = expected < _EXTINCT
     if scale == "background" and extinct:
+        named = "bright field" if bias is None else f"bias {bias:g} rad"
         raise StackError(
-            f"{label} has bias {bias:g} rad: its empty background {expected:.2g} is below {_EXTINCT:g}, "
+            f"{label} has {named}: its empty background {expected:.2g} is below {_EXTINCT:g}, "
             "too dark to scale by; give scale, the counts per empty bright field"
         )
     # the lamp is steady while the specimen moves through focus: one surface serves all planes
@@ -141,8 +145,8 @@ def _in_model_unit(
     return scaled, report
 
 
-def _empty_field(bias: float | None) -> float:
-    """The intensity of an empty image, relative to the empty bright field."""
+def _ideal_empty_field(bias: float | None) -> float:
+    """The intensity of an empty image, relative to the empty bright field, between ideal polarisers."""
     return 1.0 if bias is None else math.sin(bias / 2) ** 2
 
 
@@ -286,11 +290,10 @@ def _check_saturation(stack: Stack) -> None:
         )
 
 
-def _check_brightness(stack: Stack, reports: Sequence[PrismReport]) -> None:
-    for prism, report in enumerate(reports):
+def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequence[float]) -> None:
+    for prism, (report, expected) in enumerate(zip(reports, levels, strict=True)):
         found = report.background / report.scale
         if found > _BRIGHT:
-            expected = _empty_field(report.bias)
             warnings.warn(
                 f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g}: "
                 "float pixels count as relative to the empty bright field unless a scale is given",

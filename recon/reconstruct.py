@@ -27,7 +27,7 @@ from recon.measured import Measured, prepare
 from recon.metrics import residual_rms
 from recon.misfit import gaussian, spatial_variance
 from recon.planned import announce_record, current
-from torchdic import Fidelity, Volume, image, memory
+from torchdic import Acquisition, Fidelity, Grid, Volume, image, memory
 from torchdic.files import write_json, write_text, written_whole
 from torchdic.tiff import StackError, read_stack, write_volume
 
@@ -83,12 +83,25 @@ def load_data(config: Config) -> Measured:
         scale=section.scale,
         offset=section.offset,
         order=section.order,
+        empty=_empty_field(config),
     )
     try:
         spatial_variance(torch.from_numpy(measured.data))
     except ValueError as error:
         raise StackError(f"{section.path}: {error}") from error
     return measured
+
+
+def _empty_field(config: Config) -> list[float]:
+    """What the model's empty volume gives behind each prism: 1 and sin²(bias/2) where nothing leaks or is stopped."""
+    background = torch.tensor(config.volume.background, dtype=torch.float64)
+    point = Volume(Grid((1, 1, 1), config.volume.spacing), torch.zeros(1, 1, 1, dtype=torch.float64), background)
+    microscope, sources = replace(config.microscope, camera=None), (config.fidelity or RECOMMENDED).sources
+    with torch.no_grad():
+        images = image(
+            point, microscope, Acquisition(config.acquisition.prisms), Fidelity("projection", sources=sources)
+        )
+    return images.flatten().tolist()
 
 
 def reconstruct(

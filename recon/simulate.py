@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, image_field
+from torchdic import Acquisition, Fidelity, Grid, Microscope, image_field
 
 # The exact field is spread over an array wider by this fraction on each side and cropped after imaging: what leaves the
 # volume's sides must not come back on the other one.
@@ -50,13 +50,13 @@ def exact_images(
         return torch.stack(
             [share * exact_images(specimen, grid, p, acquisition, fidelity) for p, share in colours]
         ).sum(0)
-    points, weights = microscope.sources(fidelity, dtype=torch.float64, device=torch.device("cpu"))
+    points, weights = microscope.sources(fidelity.sources, dtype=torch.float64, device=torch.device("cpu"))
     na = None
     if microscope.objective is not None:
         na = min(1.05 * microscope.objective.na, specimen.background)
     total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), *wide.shape[1:], dtype=torch.float64)
     for some, share in zip(points.split(16), weights.split(16), strict=True):
-        part = replace(microscope, condenser=Condenser(microscope_na(microscope), some, share), camera=None)
+        part = replace(microscope.lit_from(some, share), camera=None)
         field = specimen.field(wide, microscope.wavelength, some, padding=1.0, na=na)
         images = image_field(field, wide, part, acquisition, background=specimen.background)
         total += float(share.sum()) * images
@@ -64,8 +64,3 @@ def exact_images(
     if camera is not None and camera.pixel_size is not None:
         return camera.integrate(total, grid.spacing[1:], (ny, nx))
     return total[..., top : top + ny, left : left + nx]
-
-
-def microscope_na(microscope: Microscope) -> float:
-    """The condenser's aperture; 0 without a condenser."""
-    return 0.0 if microscope.condenser is None else microscope.condenser.na

@@ -295,6 +295,34 @@ def test_simulated_counts_are_integers_that_a_reconstruction_scales_back(config,
     assert (tmp_path / "out" / "volume.ome.tif").exists()
 
 
+@pytest.mark.parametrize(
+    "microscope",
+    [
+        {"polarisation": {"analyser_extinction": 0.05, "analyser_error": 0.1}},
+        {"polarisation": {"pupil": {"retardance": {"5": [0.0, 1.0], "6": [0.8, 0.0]}}}},
+        {"condenser": {"na": 0.9}},  # wider than the objective, which stops some of its light
+        {"condenser_prism": False},
+    ],
+    ids=["leaking polarisers", "strained lenses", "stopped light", "no condenser prism"],
+)
+def test_counts_are_scaled_to_the_empty_field_of_the_microscope_that_is_declared(tmp_path, microscope):
+    """Not to sin²(bias/2), which is that of an ideal one."""
+    camera = CONFIG["microscope"]["camera"]
+    stacks = {}
+    for name, further, offset in (("counts", {"camera": camera}, camera["offset"]), ("clean", {}, 0.0)):
+        scope = {k: v for k, v in CONFIG["microscope"].items() if k != "camera"} | microscope | further
+        path = tmp_path / f"{name}.toml"
+        data = {"path": str(tmp_path / name / "stack.ome.tif"), "offset": offset}
+        parts = {"microscope": scope, "data": data, "reconstruction": {"start": "zero"}}
+        path.write_text(tomli_w.dumps(CONFIG | parts), encoding="utf-8")
+        assert main(["simulate", str(path), "--out", str(tmp_path / name), "--device", "cpu"]) == 0
+        stacks[name] = load_data(load(path))
+    found, expected = stacks["counts"].data, stacks["clean"].data
+    bias = CONFIG["acquisition"]["prisms"][0]["bias"]
+    assert abs(float(expected.mean()) - math.sin(bias / 2) ** 2) > 0.005
+    assert abs(float((found - expected).mean())) < 0.002
+
+
 def test_simulated_pixels_are_the_cameras_and_their_size_is_in_the_file(config, tmp_path, capsys):
     path = config(pixel_size=24.0, magnification=60.0)
     assert main(["simulate", str(path), "--out", str(tmp_path / "simulated"), "--device", "cpu"]) == 0

@@ -338,6 +338,14 @@ def test_each_specimen_is_simulated_from_its_file(write, run, tmp_path, specimen
     assert written.data.std(axis=(2, 3)).min() > 1e-4  # the specimen shows in every image
 
 
+def test_version_is_the_projects(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"{project['name']} {project['version']}\n"
+
+
 def test_a_folder_in_a_folder_that_is_not_there_yet_is_made(write, run, tmp_path):
     assert run("simulate", write(), out=tmp_path / "a" / "b")[0] == 0
     assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["stack.ome.tif", "stack.png"]

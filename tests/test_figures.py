@@ -82,6 +82,14 @@ def test_a_stacks_planes_are_evenly_chosen_from_first_to_last(tmp_path, planes, 
     drawn(figure, tmp_path / "stack.png")
 
 
+def test_each_row_of_a_stack_has_its_scale_of_grey():
+    stack = torch.rand(2, 3, 9, 12)
+    figure = figures.draw_stack(stack, PRISMS[:2], range(3), (0.2, 0.25))
+    bars = [ax for ax in figure.axes if ax.get_ylabel() == "intensity"]
+    for bar, row in zip(bars, stack, strict=True):
+        assert bar.get_ylim() == pytest.approx((float(row.min()), float(row.max())))
+
+
 def test_rows_run_down_the_picture():
     ax = panels(figures.draw_stack(torch.rand(1, 1, 9, 12), PRISMS[:1], (0.0,), (0.2, 0.25)))[0]
     bottom, top = ax.get_ylim()

@@ -313,6 +313,12 @@ def test_figure_names_the_front_and_only_it(some_trials):
     assert "beaten" not in {text.get_text() for axes in figure.axes for text in axes.texts}
 
 
+def test_legend_says_what_the_marks_mean(some_trials):
+    (legend,) = draw_fronts({"scene": some_trials}).legends
+    words = {text.get_text() for text in legend.get_texts()}
+    assert words == {"projection", "rays", "wave", "float64", "beaten by another", "Pareto front"}
+
+
 # --- the presets ------------------------------------------------------------------------------------------------------
 
 
@@ -341,9 +347,9 @@ def truth(benchmark):
         scene = benchmark.SCENES[name]
         parts = benchmark.MICROSCOPE, scene.acquisition
         if hasattr(scene.specimen, "field"):
-            return exact_images(scene.specimen, scene.grid, *parts, Fidelity(sources=150))
+            return exact_images(scene.specimen, scene.grid, *parts, Fidelity(sources=200))
         with torch.no_grad():
-            return image(scene.volume(), *parts, Fidelity("wave", 2 * scene.grid.shape[0], 150, padding=16))
+            return image(scene.volume(), *parts, Fidelity("wave", 2 * scene.grid.shape[0], 200, padding=16))
 
     return find
 

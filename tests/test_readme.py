@@ -44,9 +44,9 @@ def test_the_further_tables_go_into_the_configuration_and_are_simulated(tmp_path
     assert main(["simulate", str(path), "--out", str(tmp_path / "out")]) == 0
     stack = read_stack(tmp_path / "out" / "stack.ome.tif").data
     assert stack.shape == (2, 3, 64, 72)
-    # walls along y: nothing changes along them, in float32
-    assert abs(stack - stack[:, :, :1]).max() < 1e-5
-    assert stack[0].std() > stack[1].std() > 0.01
+    assert stack.std() > 0.01
+    # the rim, 1 µm wide, is even: the cell stands clear of the sides
+    assert stack[:, :, [0, -1]].std() < 0.1 * stack.std()
 
 
 @pytest.mark.slow

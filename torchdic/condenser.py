@@ -90,21 +90,56 @@ class Condenser:
             object.__setattr__(self, "weights", weights)
 
     def sources(
-        self, count: int, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+        self,
+        count: int,
+        *,
+        pupil: float | None = None,
+        dtype: torch.dtype | None = None,
+        device: torch.device | str | None = None,
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
-        """Directions n·sinθ (source, 2) and weights (source,) of sum 1; at most `count` unless points are given."""
+        """Directions n·sinθ (source, 2) and weights (source,) of sum 1; at most `count` unless points are given.
+
+        pupil: an objective's NA. Where it divides the aperture, the light within and the light beyond have directions
+        of their own (see `aperture_quadrature`).
+        """
         if self.points is not None:
             points = self.points
             weights = torch.ones(len(points)) if self.weights is None else self.weights
         elif self.na == 0:
             points, weights = torch.zeros(1, 2), torch.ones(1)
         else:
-            hole = 0.0 if self.inner_na is None else self.inner_na / self.na
-            points, weights = (torch.from_numpy(a) for a in disc_quadrature(count, hole))
-            points = points * self.na
+            rule = aperture_quadrature(count, self.na, self.inner_na or 0.0, pupil)
+            points, weights = (torch.from_numpy(a) for a in rule)
         points = points.to(device, dtype or torch.get_default_dtype())
         weights = weights.to(device, torch.float64)
         return points, (weights / weights.sum()).to(points.dtype)
+
+
+# Share of the directions at least that passes a pupil which divides the aperture: the image is theirs in the main.
+WITHIN = 0.75
+
+
+def aperture_quadrature(
+    count: int, na: float, inner_na: float = 0.0, pupil: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (m, 2) between two radii and weights (m,) that sum to 1, m ≤ count: `disc_quadrature`, or two of them.
+
+    pupil: a radius at which the integrand jumps, as it does at the edge of the objective's pupil, where direct light
+    passes or not. Each side then has a rule of its own, with its area's share of the weight, so that as much direct
+    light passes as should; otherwise the empty field would be wrong by the weight of whole rings. With too few points
+    for two rules there is one. Raises ValueError as `disc_quadrature` does.
+    """
+    least = 1 if inner_na == 0 else 2  # directions within the pupil
+    if pupil is None or not inner_na < pupil < na or count < least + 2:
+        points, weights = disc_quadrature(count, inner_na / na)
+        return na * points, weights
+    share = (pupil**2 - inner_na**2) / (na**2 - inner_na**2)
+    passing = min(max(round(count * max(share, WITHIN)), least), count - 2)
+    (within, its), (beyond, others) = (
+        aperture_quadrature(passing, pupil, inner_na),
+        aperture_quadrature(count - passing, na, pupil),
+    )
+    return np.concatenate((within, beyond)), np.concatenate((share * its, (1 - share) * others))
 
 
 def disc_quadrature(count: int, hole: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchdic.camera import Camera
 from torchdic.condenser import Condenser, Spectrum
-from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.jones import Polarisation
 from torchdic.objective import Objective
@@ -83,11 +82,19 @@ class Microscope:
         ]
 
     def sources(
-        self, fidelity: Fidelity, *, dtype: torch.dtype, device: torch.device
+        self, count: int, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
-        """Directions n·sinθ (source, 2) of the illumination and their weights (source,), which sum to 1."""
+        """Directions n·sinθ (source, 2) of the illumination and their weights (source,), as `Condenser.sources`."""
         condenser = self.condenser or Condenser(0.0)
-        return condenser.sources(fidelity.sources, dtype=dtype, device=device)
+        pupil = None if self.objective is None else self.objective.na
+        return condenser.sources(count, pupil=pupil, dtype=dtype, device=device)
+
+    def lit_from(
+        self, points: Float[Tensor, "source 2"], weights: Float[Tensor, " source"] | None = None
+    ) -> "Microscope":
+        """The microscope with some of its condenser's directions alone."""
+        na = 0.0 if self.condenser is None else self.condenser.na
+        return replace(self, condenser=Condenser(na, points, weights))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from torchdic.cost import SLAB, directions
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.image_error import relative
-from torchdic.instrument import Microscope
 from torchdic.pilots import MOST, MOST_UNSTABLE, Scene
 from torchdic.rays import TurnedRaysError
 from torchdic.scalar import number
@@ -69,11 +68,9 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         return [], pilot(coarse)
     counts = [n for n in COUNTS if condenser.inner_na is None or n > 1]
     images: list[Tensor] = []
-    cuts: list[float] = []
     beyond = 0.0
     for n, count in enumerate(counts):
         images.append(pilot(replace(coarse, sources=count)))
-        cuts.append(_cut(pilot.microscope, count, images[-1]))
         if count < 18 or n < 2:
             continue  # fewer may agree by chance
         change, before = (relative(images[i] - images[i - 1], images[-1]) for i in (n, n - 1))
@@ -82,26 +79,12 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         if counts[n - 2] > 1:
             fall = min(math.sqrt(fall * change / max(before, 1e-300)), 0.9)
         # errors of two numbers have little in common, so that their squares add up to the change's
-        beyond = math.hypot(change * fall / math.hypot(1, fall), cuts[-1])
+        beyond = change * fall / math.hypot(1, fall)
         if beyond <= MARGIN / 2 * tolerance:
             break
-    seen = zip(counts, images, cuts, strict=False)
-    choices = [Choice(replace(coarse, sources=n), i - images[-1], math.hypot(beyond, cut)) for n, i, cut in seen]
+    seen = zip(counts, images, strict=False)
+    choices = [Choice(replace(coarse, sources=n), i - images[-1], beyond) for n, i in seen]
     return choices, images[-1]
-
-
-def _cut(microscope: Microscope, sources: int, images: Tensor) -> float:
-    """The error of a condenser's direct light that the pupil's edge divides: a direction passes as a whole or not."""
-    condenser, objective = microscope.condenser, microscope.objective
-    assert condenser is not None
-    if objective is None or condenser.na <= objective.na:
-        return 0.0
-    inner, edge = condenser.inner_na or 0.0, objective.na
-    passes = (edge**2 - min(inner, edge) ** 2) / (condenser.na**2 - inner**2)
-    points, weights = condenser.sources(sources, dtype=torch.float64)
-    passed = float((weights * (points.norm(dim=-1) <= edge)).sum())
-    level = images.mean((2, 3), keepdim=True) / passed if passed > 0 else torch.ones_like(images[..., :1, :1])
-    return relative((passed - passes) * level, images)
 
 
 def sparse(pilot: Scene, counts: list[Choice], dense: Tensor) -> Scene:

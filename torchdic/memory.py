@@ -126,7 +126,7 @@ def allotted_to_fields(
 
 def levels_of(volume: Volume, plane: float, microscope: Microscope, fidelity: Fidelity) -> Levels:
     """The levels of a fidelity's object_aberration in light of one wavelength."""
-    momentum, _ = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
+    momentum, _ = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
     parts = microscope.wavelength, microscope.objective, microscope.condenser
     return object_levels(volume, plane, *parts, momentum, fidelity)
 
@@ -365,7 +365,7 @@ def _foreseen(
     levels: int = 0,
     gradient: bool | None = None,
 ) -> Foreseen:
-    momentum, _ = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
+    momentum, _ = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
     scene = _scene(volume, microscope, acquisition, fidelity, momentum, levels, gradient)
     _, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
     return _fitted(scene, ny * nx * volume.delta.element_size(), fidelity.memory, volume.delta.device)

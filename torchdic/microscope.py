@@ -61,7 +61,7 @@ def _image(
     plan: Foreseen,
 ) -> Float[Tensor, "prism focus y x"]:
     """`image` of a padded volume in light of one wavelength."""
-    momentum, weights = microscope.sources(fidelity, dtype=volume.delta.dtype, device=volume.delta.device)
+    momentum, weights = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
     fields = None if fidelity.propagation == "wave" else volume.sampled(fidelity.interpolation)
     # whether steps are computed again has been decided
     within = replace(fidelity, memory=1 if plan.slabs else sys.maxsize)
@@ -146,7 +146,7 @@ def image_field(
     real = transmission.real
     check_apertures(microscope, number(background), real.dtype)
     check_sampling(microscope, grid)
-    momentum, weights = microscope.sources(fidelity, dtype=real.dtype, device=real.device)
+    momentum, weights = microscope.sources(fidelity.sources, dtype=real.dtype, device=real.device)
     expected = (*((len(weights),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")

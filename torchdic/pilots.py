@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from torchdic.condenser import Condenser
+from torchdic.condenser import Spectrum
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.instrument import Acquisition, Microscope
@@ -18,6 +18,8 @@ from torchdic.wave import UnstableError
 
 # Voxels along each side of a pilot's window; the whole array if it isn't much wider.
 WINDOW = 64
+# Wavelengths at most.
+COLOURS = 2
 # Slabs at least of pilots that ask about something other than slabs.
 COARSE = 4
 # Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
@@ -69,7 +71,7 @@ class Scene:
         yield Fidelity("wave", steps=MOST_UNSTABLE * self.slices)
 
     def hardest(self) -> "Scene":
-        """The scene with the hardest of its images.
+        """The scene with the hardest of its images, in few colours.
 
         They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
         """
@@ -82,34 +84,28 @@ class Scene:
         away = [abs(z - plane) for z in depths]
         planes = {depths.index(min(depths)), away.index(min(away)), depths.index(max(depths))}
         focus = [self.acquisition.focus[i] for i in sorted(planes)]
-        return replace(self, acquisition=Acquisition([prisms[i] for i in sorted(picked)], focus))
+        hardest = Acquisition([prisms[i] for i in sorted(picked)], focus)
+        return replace(self, acquisition=hardest, microscope=_in_few_colours(self.microscope))
 
     def lit(self, sources: int) -> "Scene":
         """The scene with so many sources at most, a few of the condenser's own where it names them."""
         condenser = self.microscope.condenser
         if condenser is None:
             return self
-        points, weights = condenser.sources(sources, dtype=torch.float64)
+        points, weights = self.microscope.sources(sources, dtype=torch.float64)
         points, weights = points[weights > 0], weights[weights > 0]
         if len(points) > sources:
             some = torch.linspace(0, len(points) - 1, sources).round().long()
             points, weights = points[some], weights[some]
-        few = Condenser(condenser.na, points, weights)
-        return replace(self, microscope=replace(self.microscope, condenser=few))
+        return replace(self, microscope=self.microscope.lit_from(points, weights))
 
     def halves(self) -> "list[Scene]":
         """Two scenes with every other of the condenser's own sources each; itself where it names fewer than two."""
         condenser = self.microscope.condenser
         if condenser is None or condenser.points is None or len(condenser.points) < 2:
             return [self]
-        points, weights = condenser.sources(len(condenser.points))
-        return [
-            replace(
-                self,
-                microscope=replace(self.microscope, condenser=Condenser(condenser.na, points[i::2], weights[i::2])),
-            )
-            for i in (0, 1)
-        ]
+        points, weights = self.microscope.sources(len(condenser.points))
+        return [replace(self, microscope=self.microscope.lit_from(points[i::2], weights[i::2])) for i in (0, 1)]
 
     @property
     def strained(self) -> bool:
@@ -160,6 +156,21 @@ class Scene:
         assert delta is not None
         grid = Grid((shape[0], size[0], size[1]), volume.grid.spacing)
         return replace(self, volume=Volume(grid, delta, volume.background, absorption))
+
+
+def _in_few_colours(microscope: Microscope) -> Microscope:
+    """A microscope whose wavelengths are at most COLOURS, each the mean of some neighbours, with their shares."""
+    spectrum = microscope.spectrum
+    if spectrum is None or len(spectrum.wavelengths) <= COLOURS:
+        return microscope
+    lit = sorted(
+        (length, share) for length, share in zip(spectrum.wavelengths, spectrum.shares, strict=True) if share > 0
+    )
+    groups = [lit[len(lit) * i // COLOURS : len(lit) * (i + 1) // COLOURS] for i in range(COLOURS)]
+    shares = [sum(share for _, share in group) for group in groups if group]
+    means = [sum(n * w for n, w in group) / s for group, s in zip(filter(None, groups), shares, strict=True)]
+    nominal = min(max(microscope.wavelength, means[0]), means[-1])
+    return replace(microscope, wavelength=nominal, spectrum=Spectrum(means, shares))
 
 
 def _fade(size: Sequence[int], full: Sequence[int]) -> Tensor:

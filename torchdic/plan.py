@@ -58,7 +58,8 @@ class Plan:
         for e in self.effects:
             error = "—" if e.basis == "absent" else f"{'≤ ' if e.basis == 'bound' else ''}{e.error:.2g}"
             known = e.basis + (f": {e.note}" if e.note else "")
-            lines.append(f"{e.name:<18}{'yes' if e.needed else 'no':<8}{error:>14}{e.cost:>7.0%}  {known}")
+            cost = "—" if e.basis == "absent" else f"{e.cost:.0%}"
+            lines.append(f"{e.name:<18}{'yes' if e.needed else 'no':<8}{error:>14}{cost:>7}  {known}")
         verdict = "meets" if self.met else "misses" if self.error > self.tolerance else "too near to be sure of"
         return "\n".join(
             [
@@ -115,8 +116,8 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
         warnings.warn(
             f"no fidelity tried is sure to meet the tolerance {tolerance:g}, which takes a predicted error of "
             f"{MARGIN * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
-            f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for {chosen.error / MARGIN:.2g}, or take "
-            "finer voxels, a narrower condenser or wider sides",
+            f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for "
+            f"{_two_digits_up(chosen.error / MARGIN)}, or take finer voxels, a narrower condenser or wider sides",
             ToleranceWarning,
             stacklevel=3,
         )
@@ -153,7 +154,8 @@ def _climb(scene: Scene, pilot: Scene, coarse: Fidelity, tolerance: float) -> Cl
         truth = truth + dense - few(coarse)
     else:
         counts = [Choice(replace(coarse, sources=directions(scene.microscope, 1)), torch.zeros_like(truth))]
-    sides = side_ladder(replace(scene, acquisition=pilot.acquisition), coarse, tolerance)
+    whole = replace(scene, microscope=pilot.microscope, acquisition=pilot.acquisition)
+    sides = side_ladder(whole, coarse, tolerance)
     return Climbed(few, coarse, truth, ways, counts, sides)
 
 
@@ -182,6 +184,14 @@ def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) ->
             return choice
     most = max(way.fidelity.steps or 0 for way in climbed.ways)
     raise UnstableError(f"no number of slabs up to {most} carries the light of all sources")
+
+
+def _two_digits_up(value: float) -> str:
+    """A value to two digits, rounded up, so that asking for it is enough; as it is where it isn't finite."""
+    if not 0 < value < math.inf:
+        return f"{value:g}"
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.ceil(value / unit) * unit:.2g}"
 
 
 def _detached(volume: Volume) -> Volume:

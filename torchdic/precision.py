@@ -208,8 +208,8 @@ def ladder(grid: Grid, *, padded: bool = True) -> list[Candidate]:
         Candidate(Fidelity("wave"), "float64"),
         Candidate(Fidelity("wave", padding=margin)),
         Candidate(Fidelity("wave", steps=2 * slices)),
-        Candidate(Fidelity("wave", sources=80)),
-        Candidate(Fidelity("wave", steps=2 * slices, sources=80, padding=margin)),
+        Candidate(Fidelity("wave", sources=72)),
+        Candidate(Fidelity("wave", steps=2 * slices, sources=72, padding=margin)),
     ]
     return list(dict.fromkeys(rungs))  # without padding two are alike
 

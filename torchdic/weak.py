@@ -174,7 +174,7 @@ def _kernel(
         return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
     depths, overlaps = _slabs(grid, fidelity, dtype, device)
-    momentum, weights = microscope.sources(fidelity, dtype=dtype, device=device)
+    momentum, weights = microscope.sources(fidelity.sources, dtype=dtype, device=device)
     foci = torch.stack([scalar(z, momentum) for z in acquisition.focus])
 
     def contribution(momentum: Tensor, weights: Tensor) -> Tensor:
