@@ -29,6 +29,7 @@ from torchdic import (
     Objective,
     Polarisation,
     Prism,
+    Spectrum,
     ToleranceWarning,
     Volume,
     image,
@@ -100,10 +101,19 @@ def scenes() -> dict[str, Scene]:
         "smooth ball, ring of light, loose": Scene(
             _volume(GaussianBall(1.2, 0.03, 1.36).delta(GRID), 1.36), 0.1, microscope=ring
         ),
+        "smooth ball, light beyond the pupil, loose": Scene(
+            _volume(GaussianBall(1.2, 0.03, 1.36).delta(GRID), 1.36),
+            0.2,
+            Microscope(0.546, Objective(0.5), Condenser(0.7)),
+        ),
         "thick graded index": Scene(_volume(rod, 1.36), padding=0),
         "weak bead": Scene(_volume(Bead(2.0, 0.005, 1.56).delta(GRID), 1.56)),
         "strong bead, loose": Scene(_volume(Bead(2.0, 0.08, 1.36).delta(GRID), 1.36), 0.1),
         "cell": Scene(_volume(cell, 1.335)),
+        "cell in nine colours": Scene(
+            _volume(cell, 1.335),
+            microscope=replace(MICROSCOPE, spectrum=Spectrum([0.47 + 0.02 * n for n in range(9)])),
+        ),
         "absorbing cell": Scene(_volume(cell, 1.335, 0.1 * cell.clamp_min(0))),
     }
     draw = random.Random(SEED)

@@ -8,6 +8,7 @@ import difflib
 import math
 import os
 import tomllib
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,6 +47,10 @@ NONE = "none"  # TOML has no null: this is how to switch off what has a default
 
 class ConfigError(ValueError):
     """A configuration that can't be used: one line with the file, the key, the value and the law."""
+
+
+class UnitsWarning(UserWarning):
+    """A value of a configuration that is so large that another unit was likely meant."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +185,11 @@ class Config:
 
 
 def load(path: str | os.PathLike[str]) -> Config:
-    """Read a configuration file; relative paths in it start from its folder. Raises ConfigError."""
+    """Read a configuration file; relative paths in it start from its folder.
+
+    Raises ConfigError. Warns UnitsWarning of a bias beyond a whole turn and of a shear longer than the volume is wide,
+    as they are in degrees and nm.
+    """
     path = Path(path)
     try:
         text = path.read_bytes().decode("utf-8")
@@ -193,7 +202,25 @@ def load(path: str | os.PathLike[str]) -> Config:
     if config.data is not None:
         data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
         config = dataclasses.replace(config, data=data)
+    _warn_of_other_units(config, path)
     return config
+
+
+def _warn_of_other_units(config: Config, path: Path) -> None:
+    widest = max(config.volume.grid.extent[1:])
+    for index, prism in enumerate(config.acquisition.prisms):
+        if prism is None:
+            continue
+        named = f"{path}: acquisition.prisms[{index}]"
+        shear, bias = math.hypot(*map(float, prism.shear)), float(prism.bias)
+        if abs(bias) > 2 * math.pi:
+            warnings.warn(f"{named}.bias: {bias:g} is more than a turn; angles are in rad", UnitsWarning, stacklevel=3)
+        if shear > widest:
+            warnings.warn(
+                f"{named}.shear: {shear:g} is longer than the volume's {widest:g} µm; lengths are in µm",
+                UnitsWarning,
+                stacklevel=3,
+            )
 
 
 def structure(values: object, kind: type[T], source: str, where: str = "") -> T:

@@ -8,7 +8,7 @@ import tomli_w
 import torch
 
 from recon.bounds import Bounds
-from recon.config import Config, ConfigError, VolumeSection, dump, flat, load
+from recon.config import Config, ConfigError, UnitsWarning, VolumeSection, dump, flat, load
 from recon.descend import Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
 
@@ -405,3 +405,27 @@ def test_a_missing_file_and_a_folder_are_told(tmp_path):
 
 def test_an_empty_file_misses_its_first_section(write):
     assert the_error(write("")) == "missing key volume"
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ("bias = -1.5708", "bias = -90", r"prisms\[1\]\.bias: -90 is more than a turn; angles are in rad"),
+        (
+            "shear = [0.0, 0.24]",
+            "shear = [0, 240]",
+            r"prisms\[0\]\.shear: 240 is longer than .* 12\.8 µm; lengths are in µm",
+        ),
+    ],
+)
+def test_degrees_and_nanometres_are_warned_of(write, right, wrong, words):
+    path = write(CONTRACT.replace(right, wrong))
+    with pytest.warns(UnitsWarning, match=words) as warned:
+        load(path)
+    assert len(warned) == 1
+    assert str(path) in str(warned[0].message)
+
+
+def test_a_volume_one_voxel_wide_may_be_narrower_than_the_shear(write):
+    """Nothing changes along that side."""
+    load(write(CONTRACT.replace("[20, 64, 64]", "[20, 64, 1]")))

@@ -29,6 +29,7 @@ from torchdic import (
     Plan,
     Polarisation,
     Prism,
+    Spectrum,
     ToleranceWarning,
     Volume,
     image,
@@ -146,6 +147,11 @@ def ring_and_bright_field():
     return Scene(gaussian(0.02, 1.0), 0.1, ring, Acquisition([None, Prism((0.1, 0.1), 0.6)], [0.0, 1.5]))
 
 
+def many_colours():
+    spectrum = Spectrum([0.45, 0.48, 0.5, 0.53, 0.56, 0.6, 0.65], [1, 3, 4, 5, 4, 2, 1])
+    return Scene(gaussian(0.02, 0.6), 0.02, replace(MICROSCOPE, spectrum=spectrum))
+
+
 SIMPLE = [thin_weak, empty, layered]
 REST = [
     coherent,
@@ -157,6 +163,7 @@ REST = [
     wide_condenser,
     far_out_of_focus,
     ring_and_bright_field,
+    many_colours,
 ]
 
 
