@@ -148,7 +148,7 @@ def ring_and_bright_field():
 
 
 def many_colours():
-    spectrum = Spectrum([0.45, 0.48, 0.5, 0.53, 0.56, 0.6, 0.65], [1, 3, 4, 5, 4, 2, 1])
+    spectrum = Spectrum([0.47, 0.49, 0.51, 0.53, 0.56, 0.6, 0.65], [1, 3, 4, 5, 4, 2, 1])
     return Scene(gaussian(0.02, 0.6), 0.02, replace(MICROSCOPE, spectrum=spectrum))
 
 
