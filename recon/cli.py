@@ -153,7 +153,7 @@ def _simulate(options: argparse.Namespace) -> None:
             prepare_folder(options.out)
             if config.tolerance is not None:
                 planned = plan(volume, microscope, acquisition, config.tolerance)
-                print(f"{announce(planned)}, {planned.seconds:.2g} s", flush=True)
+                print(f"{announce(planned)}, predicted {planned.seconds:.2g} s", flush=True)
                 fidelity = planned.fidelity
                 write_json(options.out / "plan.json", planned.as_dict())
                 resolved = replace(config, fidelity=fidelity, tolerance=None)
@@ -265,12 +265,20 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
 
 
+class _Version(argparse.Action):
+    """Looks the version up only if it is asked for: a checkout may not be installed."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        print(f"{parser.prog} {version('torchdic')}")
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="torchdic",
         description="Simulate DIC images, and reconstruct the refractive-index volume behind them.",
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {version('torchdic')}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     out = _Parser(add_help=False)
     out.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")

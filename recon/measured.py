@@ -70,10 +70,11 @@ def prepare(
     biases: one per prism, rad; None is bright field. focus: one per plane, µm. pixel_size: (y, x) in µm,
     which wins over the file's; None takes the file's. pixels: (y, x) of the model, checked where given.
     flatten: divide by the slow background, a polynomial surface of total degree `order`, one per prism; an
-    extinct prism's background (`empty` below 1e-3) is stray light and is subtracted instead.
-    scale: the file's unit per empty bright field, or "background" for what takes the empty field to
-    `empty`. offset: the camera's dark counts in the file's unit, subtracted first. empty: the empty field's
-    intensity behind each prism; None is that of ideal polarisers, sin²(bias/2), and in bright field 1.
+    extinct prism's background (`empty` below 1e-3) is stray light and is replaced by `empty` instead.
+    scale: the file's unit per empty bright field of which the objective stops nothing, or "background" for
+    what takes the empty field to `empty`. offset: the camera's dark counts in the file's unit, subtracted
+    first. empty: the empty field's intensity behind each prism; None is that of ideal polarisers,
+    sin²(bias/2), and in bright field 1.
     By default integers are flattened and scaled by their background; floats count as relative to the empty
     bright field and are left alone.
     Raises StackError where prisms, planes or pixels are not as many as said, no pixel size is known, an
@@ -132,7 +133,7 @@ def _in_model_unit(
     for plane, image in enumerate(images):
         light = image.astype(np.float64) - offset
         if flatten:
-            light = light - surface if extinct else light * (level / surface)
+            light = light - surface + expected * unit if extinct else light * (level / surface)
         scaled[plane] = light / unit
     noise = noise_level(images)
     report = PrismReport(

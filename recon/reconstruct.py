@@ -93,10 +93,13 @@ def load_data(config: Config) -> Measured:
 
 
 def _empty_field(config: Config) -> list[float]:
-    """What the model's empty volume gives behind each prism: 1 and sin²(bias/2) where nothing leaks or is stopped."""
+    """What the model's empty volume gives behind each prism: 1 and sin²(bias/2) where nothing leaks or is stopped.
+
+    In as many directions as the fidelity has, in many where it has yet to be planned.
+    """
     background = torch.tensor(config.volume.background, dtype=torch.float64)
     point = Volume(Grid((1, 1, 1), config.volume.spacing), torch.zeros(1, 1, 1, dtype=torch.float64), background)
-    microscope, sources = replace(config.microscope, camera=None), (config.fidelity or RECOMMENDED).sources
+    microscope, sources = replace(config.microscope, camera=None), (config.fidelity or Fidelity(sources=200)).sources
     with torch.no_grad():
         images = image(
             point, microscope, Acquisition(config.acquisition.prisms), Fidelity("projection", sources=sources)

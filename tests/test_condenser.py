@@ -206,6 +206,10 @@ def test_as_much_direct_light_passes_the_pupil_as_should(na, inner, count):
     passes = float(weights[radius <= 0.6].sum())
     assert passes == pytest.approx((0.6**2 - hole**2) / (na**2 - hole**2), rel=1e-12)
     assert float(weights.sum()) == pytest.approx(1, rel=1e-12)
+    if count >= 40:  # each has its opposite, of the same weight
+        apart, opposite = torch.cdist(points, -points).min(1)
+        assert float(apart.max()) < 1e-6
+        torch.testing.assert_close(weights[opposite], weights)
     torch.testing.assert_close(weights @ points, torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-12)
 
 

@@ -175,8 +175,11 @@ def test_counts_at_extinction_need_a_scale(bias):
     with pytest.raises(StackError, match=r"stack\.tif: prism 0 .*too dark to scale by; give scale"):
         prepare(stack, [bias], [0.0], (0.1, 0.1))
     ready = prepare(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100)
-    # stray light is additive: subtracted, so that the specimen's own light stays what it was
-    assert np.abs(ready.data[0, 0] - light / 1000).max() < 1.0 / 1000  # rounding and the fit of it, in counts
+    # stray light is additive: subtracted, so that the specimen's own light stays what it was, on the model's background
+    empty = math.sin(bias / 2) ** 2
+    assert np.abs(ready.data[0, 0] - empty - light / 1000).max() < 1.0 / 1000  # rounding and the fit of it, in counts
+    leaking = prepare(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100, empty=[8e-4])
+    assert leaking.data - ready.data == pytest.approx(8e-4 - empty, abs=1e-7)
 
 
 def test_a_background_must_be_above_the_offset():

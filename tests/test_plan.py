@@ -518,6 +518,27 @@ def test_coherent_light_keeps_its_rings_far_beyond_the_sides():
     assert 0.06 < made.error < 0.12  # 0.074 against 150 voxels of padding
 
 
+@pytest.mark.parametrize("wavelength", [0.55, 0.6])
+def test_slabs_carry_the_shortest_of_many_colours(wavelength):
+    grid = Grid((4, 24, 24), (0.8, 0.12, 0.12))
+    bead = volume(Bead(1.0, 0.25, 1.36).delta(grid), grid)
+    microscope = Microscope(wavelength, Objective(0.6), Condenser(0.3), spectrum=Spectrum([0.4, 0.5, 0.6, 0.7, 0.8]))
+    acquisition = Acquisition([SHEARED])
+    made = plan(bead, microscope, acquisition, 0.3)
+    assert bool(torch.isfinite(image(bead, microscope, acquisition, made.fidelity)).all())
+
+
+def test_a_spectrum_is_left_out_for_light_of_the_nominal_wavelength():
+    ball = gaussian(0.02, 0.6)
+    microscope = Microscope(0.5, Objective(0.6), Condenser(0.3), spectrum=Spectrum([0.5, 0.6, 0.61], [0, 1, 1]))
+    acquisition = Acquisition([SHEARED], [1.0])
+    found = by_name(plan(ball, microscope, acquisition, 0.05))["spectrum"]
+    wave = Fidelity("wave", sources=32)
+    with_, without = (image(ball, m, acquisition, wave) for m in (microscope, replace(microscope, spectrum=None)))
+    assert found.error == pytest.approx(image_error(without, with_), rel=0.3)
+    assert found.needed
+
+
 # its manners
 
 
@@ -530,6 +551,7 @@ def test_what_the_warning_says_to_ask_for_is_enough(tolerance):
         made = plan(ball, Microscope(0.546, Objective(0.1)), acquisition, tolerance)
     (asked,) = re.findall(r"ask for ([\d.]+),", str(warned[0].message))
     assert made.error <= MARGIN * float(asked) < 1.1 * made.error
+    assert plan(ball, Microscope(0.546, Objective(0.1)), acquisition, float(asked)).met
 
 
 def test_planning_is_the_same_each_time_and_leaves_no_graph():

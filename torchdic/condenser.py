@@ -126,8 +126,8 @@ def aperture_quadrature(
 
     pupil: a radius at which the integrand jumps, as it does at the edge of the objective's pupil, where direct light
     passes or not. Each side then has a rule of its own, with its area's share of the weight, so that as much direct
-    light passes as should; otherwise the empty field would be wrong by the weight of whole rings. With too few points
-    for two rules there is one. Raises ValueError as `disc_quadrature` does.
+    light passes as should; otherwise the empty field would be wrong by the weight of whole rings. Both are `even`. With
+    too few points for two rules there is one. Raises ValueError as `disc_quadrature` does.
     """
     least = 1 if inner_na == 0 else 2  # directions within the pupil
     if pupil is None or not inner_na < pupil < na or count < least + 2:
@@ -135,21 +135,19 @@ def aperture_quadrature(
         return na * points, weights
     share = (pupil**2 - inner_na**2) / (na**2 - inner_na**2)
     passing = min(max(round(count * max(share, WITHIN)), least), count - 2)
-    (within, its), (beyond, others) = (
-        aperture_quadrature(passing, pupil, inner_na),
-        aperture_quadrature(count - passing, na, pupil),
-    )
-    return np.concatenate((within, beyond)), np.concatenate((share * its, (1 - share) * others))
+    within, its = disc_quadrature(passing, inner_na / pupil, even=True)
+    beyond, others = disc_quadrature(count - len(its), pupil / na, even=True)
+    return np.concatenate((pupil * within, na * beyond)), np.concatenate((share * its, (1 - share) * others))
 
 
-def disc_quadrature(count: int, hole: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def disc_quadrature(count: int, hole: float = 0.0, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 2) in the unit disc and weights (m,) that sum to 1, m ≤ count, for the mean over the disc.
 
     K rings at the Gauss nodes of r², each with M equally spaced azimuths: exact for polynomials of degree below
     min(4K, M). The rings are turned by half a step against each other, so that what their azimuths miss beyond that, up
     to about 2M, nearly cancels: K and M are chosen for it, and where they tie more rings are.
     hole: radius from 0 to 1 within which there is no light; the nodes then lie between hole² and 1, and the narrower
-    that interval, the fewer rings it takes.
+    that interval, the fewer rings it takes. even: whether M must be, where there are four points or more.
     Raises ValueError for no sources, or a single one where there is a hole, which would light from one side.
     """
     if count < 1:
@@ -159,9 +157,10 @@ def disc_quadrature(count: int, hole: float = 0.0) -> tuple[np.ndarray, np.ndarr
             raise ValueError("an annular condenser needs at least 2 sources, not 1: a single one lights from one side")
         return np.zeros((1, 2)), np.ones(1)
     width = 1 - hole**2
-    fitting = range(1, (count if hole == 0 else count // 2) + 1) if width > 0 else (1,)
+    step, least = (2, 4) if even and count >= 4 else (1, 1 if hole == 0 else 2)
+    fitting = range(1, count // least + 1) if width > 0 else (1,)
     rings, azimuths = max(
-        ((k, count // k) for k in fitting),
+        ((k, count // k // step * step) for k in fitting),
         key=lambda rule: (min(2 * rule[0] / width, rule[1]) if width > 0 else 0, rule[0]),
     )
     nodes, node_weights = np.polynomial.legendre.leggauss(rings)

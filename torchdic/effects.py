@@ -119,7 +119,9 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
     else:
         found.append(without("absorption", *(_clear(s) for s in (pilot, scene))))
     if microscope.spectrum is not None:
-        found.append(without("spectrum", *(_changed(s, spectrum=None) for s in (pilot, scene))))
+        one = _changed(scene, spectrum=None)
+        nominal = replace(pilot.microscope, spectrum=None, wavelength=microscope.wavelength)  # the pilot's differs
+        found.append(without("spectrum", replace(pilot, microscope=nominal), one))
     camera = microscope.camera
     if camera is None:
         found.append(_absent("camera"))

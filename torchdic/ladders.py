@@ -25,7 +25,7 @@ from torchdic.wave import UnstableError
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
 MARGIN = 0.6
-# Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be.
+# Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be within a pupil.
 COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
 # Sources that see the sides.
 AT_SIDES = 8

@@ -159,7 +159,10 @@ class Scene:
 
 
 def _in_few_colours(microscope: Microscope) -> Microscope:
-    """A microscope whose wavelengths are at most COLOURS, each the mean of some neighbours, with their shares."""
+    """A microscope whose wavelengths are at most COLOURS, each for some neighbours, with their shares.
+
+    The first is the shortest of all, which asks for the thinnest slabs, the others are means.
+    """
     spectrum = microscope.spectrum
     if spectrum is None or len(spectrum.wavelengths) <= COLOURS:
         return microscope
@@ -169,6 +172,7 @@ def _in_few_colours(microscope: Microscope) -> Microscope:
     groups = [lit[len(lit) * i // COLOURS : len(lit) * (i + 1) // COLOURS] for i in range(COLOURS)]
     shares = [sum(share for _, share in group) for group in groups if group]
     means = [sum(n * w for n, w in group) / s for group, s in zip(filter(None, groups), shares, strict=True)]
+    means[0] = lit[0][0]
     nominal = min(max(microscope.wavelength, means[0]), means[-1])
     return replace(microscope, wavelength=nominal, spectrum=Spectrum(means, shares))
 
