@@ -78,10 +78,8 @@ def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str]
             ax.set_xlabel("seconds, images and gradient" if of_gradient else "seconds, images", fontsize=8)
         axes[0].set_ylabel("error (relative L2)" if of_gradient else "error (rms / contrast)", fontsize=8)
     shown = {trial.candidate.fidelity.propagation for trials in scenes.values() for trial in trials}
-    handles = [
-        grid[0, 0].plot([], [], MARKERS[name], color=COLOURS[name], label=name)[0] for name in COLOURS if name in shown
-    ]
     plot = grid[0, 0].plot
+    handles = [plot([], [], MARKERS[name], color=COLOURS[name], label=name)[0] for name in COLOURS if name in shown]
     handles += plot([], [], "x", color="0.3", label="float64")
     handles += plot([], [], "o", color="0.3", alpha=PALE, markersize=4, label="beaten by another")
     handles += plot([], [], color="0.6", linewidth=1, label="Pareto front")

@@ -97,13 +97,11 @@ def _empty_field(config: Config) -> list[float]:
 
     In as many directions as the fidelity has, in many where it has yet to be planned.
     """
-    background = torch.tensor(config.volume.background, dtype=torch.float64)
-    point = Volume(Grid((1, 1, 1), config.volume.spacing), torch.zeros(1, 1, 1, dtype=torch.float64), background)
-    microscope, sources = replace(config.microscope, camera=None), (config.fidelity or Fidelity(sources=200)).sources
+    nothing = torch.zeros(1, 1, 1, dtype=torch.float64)
+    point = Volume(Grid((1, 1, 1), config.volume.spacing), nothing, config.volume.background)
+    fidelity = Fidelity("projection", sources=200 if config.fidelity is None else config.fidelity.sources)
     with torch.no_grad():
-        images = image(
-            point, microscope, Acquisition(config.acquisition.prisms), Fidelity("projection", sources=sources)
-        )
+        images = image(point, replace(config.microscope, camera=None), Acquisition(config.acquisition.prisms), fidelity)
     return images.flatten().tolist()
 
 

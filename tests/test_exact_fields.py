@@ -85,9 +85,7 @@ def test_wider_condenser_asks_more_of_straight_rays(table, exact):
 
 
 def test_directions_reach_the_condenser_s_edge_on_all_sides(table):
-    points, weights = table.microscope(0.8).sources(
-        table.Fidelity().sources, dtype=torch.float64, device=torch.device("cpu")
-    )
+    points, weights = table.microscope(0.8).sources(40, dtype=torch.float64)
     assert points.shape == (13, 2)
     assert float(points.norm(dim=1).max()) == pytest.approx(0.8)
     torch.testing.assert_close(weights @ points, torch.zeros(2, dtype=torch.float64), rtol=0, atol=1e-15)

@@ -80,9 +80,7 @@ def test_colours_share_the_sources_directions():
     assert sum(share for _, share in scope.colours()) == 1
     assert all(part.spectrum is None for part, _ in scope.colours())
     for part, _ in scope.colours():
-        assert torch.equal(
-            part.sources(Fidelity("wave").sources, dtype=torch.float64, device=torch.device("cpu"))[0], POINTS
-        )
+        assert torch.equal(part.sources(40, dtype=torch.float64)[0], POINTS)
 
 
 def test_weak_specimen_is_linear_in_each_colour(volume, acquisition):
@@ -245,7 +243,7 @@ def test_absent_effects_leave_the_image_to_its_rounding(volume, acquisition, pro
     """Written out on the whole array without any of them: aperture, aberrations, exact defocus, shear and bias."""
     volume = Volume(volume.grid, volume.delta.to(dtype), N0)
     scope, fidelity = Microscope(0.546, Objective(0.75, {4: 0.3, 7: -0.2}), Condenser(0.4)), Fidelity(propagation)
-    momentum, weights = scope.sources(fidelity.sources, dtype=dtype, device=torch.device("cpu"))
+    momentum, weights = scope.sources(fidelity.sources, dtype=dtype)
     plane = volume.grid.extent[0] / 2 if propagation == "wave" else volume.mean_plane()
     spectrum = propagate(volume, 0.546, momentum, plane, fidelity)
     frequencies = volume.grid.frequencies(dtype=dtype)

@@ -9,6 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+# Share of the directions at least that passes a pupil which divides the aperture: the image is theirs in the main.
+WITHIN = 0.75
+
 
 @dataclass(frozen=True)
 class Spectrum:
@@ -113,10 +116,6 @@ class Condenser:
         points = points.to(device, dtype or torch.get_default_dtype())
         weights = weights.to(device, torch.float64)
         return points, (weights / weights.sum()).to(points.dtype)
-
-
-# Share of the directions at least that passes a pupil which divides the aperture: the image is theirs in the main.
-WITHIN = 0.75
 
 
 def aperture_quadrature(

@@ -119,9 +119,9 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
     else:
         found.append(without("absorption", *(_clear(s) for s in (pilot, scene))))
     if microscope.spectrum is not None:
-        one = _changed(scene, spectrum=None)
-        nominal = replace(pilot.microscope, spectrum=None, wavelength=microscope.wavelength)  # the pilot's differs
-        found.append(without("spectrum", replace(pilot, microscope=nominal), one))
+        nominal = microscope.wavelength  # the pilot's differs
+        one = (_changed(s, spectrum=None, wavelength=nominal) for s in (pilot, scene))
+        found.append(without("spectrum", *one))
     camera = microscope.camera
     if camera is None:
         found.append(_absent("camera"))
@@ -139,7 +139,7 @@ def _absent(name: str) -> Effect:
     return Effect(name, False, 0.0, 0.0, "absent")
 
 
-def _changed(scene: Scene, **parts: None) -> Scene:
+def _changed(scene: Scene, **parts: float | None) -> Scene:
     return replace(scene, microscope=replace(scene.microscope, **parts))
 
 

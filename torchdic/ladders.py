@@ -83,8 +83,7 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
         if beyond <= MARGIN / 2 * tolerance:
             break
     seen = zip(counts, images, strict=False)
-    choices = [Choice(replace(coarse, sources=n), i - images[-1], beyond) for n, i in seen]
-    return choices, images[-1]
+    return [Choice(replace(coarse, sources=count), i - images[-1], beyond) for count, i in seen], images[-1]
 
 
 def sparse(pilot: Scene, counts: list[Choice], dense: Tensor) -> Scene:

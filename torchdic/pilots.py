@@ -18,8 +18,6 @@ from torchdic.wave import UnstableError
 
 # Voxels along each side of a pilot's window; the whole array if it isn't much wider.
 WINDOW = 64
-# Wavelengths at most.
-COLOURS = 2
 # Slabs at least of pilots that ask about something other than slabs.
 COARSE = 4
 # Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
@@ -71,7 +69,7 @@ class Scene:
         yield Fidelity("wave", steps=MOST_UNSTABLE * self.slices)
 
     def hardest(self) -> "Scene":
-        """The scene with the hardest of its images, in few colours.
+        """The scene with the hardest of its images, in two colours at most.
 
         They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
         """
@@ -85,7 +83,7 @@ class Scene:
         planes = {depths.index(min(depths)), away.index(min(away)), depths.index(max(depths))}
         focus = [self.acquisition.focus[i] for i in sorted(planes)]
         hardest = Acquisition([prisms[i] for i in sorted(picked)], focus)
-        return replace(self, acquisition=hardest, microscope=_in_few_colours(self.microscope))
+        return replace(self, acquisition=hardest, microscope=_in_two_colours(self.microscope))
 
     def lit(self, sources: int) -> "Scene":
         """The scene with so many sources at most, a few of the condenser's own where it names them."""
@@ -158,23 +156,20 @@ class Scene:
         return replace(self, volume=Volume(grid, delta, volume.background, absorption))
 
 
-def _in_few_colours(microscope: Microscope) -> Microscope:
-    """A microscope whose wavelengths are at most COLOURS, each for some neighbours, with their shares.
+def _in_two_colours(microscope: Microscope) -> Microscope:
+    """A microscope with two wavelengths at most: the shortest, which asks for the thinnest slabs, and a mean.
 
-    The first is the shortest of all, which asks for the thinnest slabs, the others are means.
+    They stand for the shorter and the longer half of those that are lit, with their shares.
     """
     spectrum = microscope.spectrum
-    if spectrum is None or len(spectrum.wavelengths) <= COLOURS:
+    if spectrum is None or len(spectrum.wavelengths) <= 2:
         return microscope
-    lit = sorted(
-        (length, share) for length, share in zip(spectrum.wavelengths, spectrum.shares, strict=True) if share > 0
-    )
-    groups = [lit[len(lit) * i // COLOURS : len(lit) * (i + 1) // COLOURS] for i in range(COLOURS)]
-    shares = [sum(share for _, share in group) for group in groups if group]
-    means = [sum(n * w for n, w in group) / s for group, s in zip(filter(None, groups), shares, strict=True)]
-    means[0] = lit[0][0]
-    nominal = min(max(microscope.wavelength, means[0]), means[-1])
-    return replace(microscope, wavelength=nominal, spectrum=Spectrum(means, shares))
+    lit = sorted(pair for pair in zip(spectrum.wavelengths, spectrum.shares, strict=True) if pair[1] > 0)
+    half = len(lit) // 2
+    below, above = (sum(share for _, share in part) for part in (lit[:half], lit[half:]))
+    shortest, mean = lit[0][0], sum(length * share for length, share in lit[half:]) / above
+    nominal = min(max(microscope.wavelength, shortest), mean)
+    return replace(microscope, wavelength=nominal, spectrum=Spectrum([shortest, mean], [below, above]))
 
 
 def _fade(size: Sequence[int], full: Sequence[int]) -> Tensor:
