@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from data_synthetic import Bead, CellPhantom, GaussianBall
 from data_synthetic.specimen import Specimen
-from recon import figures
-from recon.fronts import as_table, draw_fronts
-from recon.simulate import ExactSpecimen, exact_images
+from recon.report import figures
+from recon.report.fronts import as_table, draw_fronts
+from recon.run.exact_images import ExactSpecimen, exact_images
 from torchdic import (
     DRAFT,
     REFERENCE,
@@ -36,7 +36,7 @@ from torchdic import (
     Volume,
 )
 from torchdic.fidelity import Propagation
-from torchdic.precision import ladder, trials
+from torchdic.planning.work_precision import ladder, trials
 
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.7))
 PRISM = Prism((0.0, 0.24), 1.5708)

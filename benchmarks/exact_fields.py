@@ -17,10 +17,10 @@ from torch import Tensor
 
 from comparison import header, row, trial
 from data_synthetic import Bead, GaussianBall
-from recon.simulate import MARGIN, exact_images
+from recon.run.exact_images import MARGIN, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume
+from torchdic.errors import TurnedRaysError
 from torchdic.fidelity import Propagation
-from torchdic.rays import TurnedRaysError
 
 WAVELENGTH = 0.546
 NA = 0.9

@@ -27,7 +27,7 @@ from torchdic import (
     foreseen,
     image,
 )
-from torchdic.precision import peak_bytes
+from torchdic.planning.work_precision import peak_bytes
 
 MIB = 1 << 20
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.6))

@@ -15,8 +15,8 @@ import torch
 from torch.nn import Parameter
 
 from torchdic import Fidelity, Grid, Rays, Volume, trace
-from torchdic.cost import timed
-from torchdic.ray_solver import TABLEAUX
+from torchdic.planning.cost import timed
+from torchdic.rays.solver import TABLEAUX
 
 RAY_FORWARD, RAY_BACKWARD = 2 * 5 + 3, 3 + 2 * 5
 SLICE_FORWARD, SLICE_BACKWARD = 2, 2 + 2 * 2

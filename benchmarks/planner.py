@@ -35,8 +35,8 @@ from torchdic import (
     image,
     plan,
 )
-from torchdic.image_error import image_error
-from torchdic.plan import describe
+from torchdic.planning.image_error import image_error
+from torchdic.planning.plan import describe
 
 GRID = Grid((20, 96, 96), (0.4, 0.2, 0.2))
 MICROSCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))

@@ -47,7 +47,7 @@ class Torchdic:
 
     def run(self):
         """Deviation and OPD as tensors."""
-        from torchdic.rays import deviation
+        from torchdic.rays.trace import deviation
 
         change = deviation(self.volume, self.rays, self.fidelity)
         return change.position.T, change.opd

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from data_synthetic import EtchedGlassGrating, EtchedGlassStep
 from data_synthetic.etched import EtchedGlass
-from recon import figures
+from recon.report import figures
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
 
 GRID = Grid((16, 128, 128), (0.025, 0.125, 0.125))

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from data_synthetic import Bead
-from recon import figures
-from recon.simulate import MARGIN, exact_images
+from recon.report import figures
+from recon.run.exact_images import MARGIN, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BEAD = Bead(radius=5.0, contrast=0.03, background=1.56)

@@ -22,9 +22,9 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from recon import figures
+from recon.report import figures
 from torchdic import Grid, Volume
-from torchdic.aberration import effective_defocus
+from torchdic.object_aberration.wavefront import effective_defocus
 
 BACKGROUND = 1.33
 CONTRAST = 0.08

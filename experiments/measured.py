@@ -18,14 +18,16 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 
-from recon import figures
-from recon.checkpoint import CheckpointError
-from recon.config import Config, ConfigError, DataSection, load
-from recon.measured import background_surface
-from recon.reconstruct import reconstruct
-from recon.shear_axis import ShearAxis, estimate_shear_axis
+from recon.config.reading import load
+from recon.config.schema import Config, ConfigError, DataSection
+from recon.recording.background import background_surface
+from recon.recording.shear_axis import ShearAxis, estimate_shear_axis
+from recon.report import figures
+from recon.run.checkpoint import CheckpointError
+from recon.run.reconstruct import reconstruct
 from torchdic import Acquisition, Prism
-from torchdic.tiff import StackError, read_stack
+from torchdic.errors import StackError
+from torchdic.files.stack import read_stack
 
 CONFIG = Path(__file__).with_name("measured.toml")
 

@@ -31,15 +31,17 @@ from data_synthetic import (
     GradedIndexRod,
     LayeredMedium,
 )
-from recon import figures
-from recon.checkpoint import CheckpointError
-from recon.compare import compare, table
-from recon.config import Config, ConfigError, dump, load, structure
-from recon.descend import Recipe
-from recon.fronts import as_dict, as_table, draw_fronts, write_csv
-from recon.planned import announce
-from recon.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
-from recon.simulate import exact_images
+from recon.config.conversion import dump
+from recon.config.reading import load, structure
+from recon.config.schema import Config, ConfigError
+from recon.fit.descent import Recipe
+from recon.fit.planned import announce
+from recon.report import figures
+from recon.report.comparison import compare, table
+from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
+from recon.run.checkpoint import CheckpointError
+from recon.run.exact_images import exact_images
+from recon.run.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
 from torchdic import (
     STANDARD,
     Acquisition,
@@ -56,15 +58,14 @@ from torchdic import (
     image,
     plan,
 )
+from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.fidelity import Propagation
-from torchdic.files import write_json, write_text
-from torchdic.ladders import reaches_a_side
-from torchdic.landing import SidewaysError
-from torchdic.memory import allotted, check_volume
-from torchdic.precision import converged_fidelities, ladder, trials
-from torchdic.rays import TurnedRaysError
-from torchdic.tiff import StackError, write_stack
-from torchdic.wave import UnstableError
+from torchdic.files.stack import write_stack
+from torchdic.files.whole import write_json, write_text
+from torchdic.forward.foresee import allotted
+from torchdic.memory.free import check_volume
+from torchdic.planning.ladders import reaches_a_side
+from torchdic.planning.work_precision import converged_fidelities, ladder, trials
 
 SPECIMENS: dict[str, type] = {
     "bead": Bead,

@@ -22,10 +22,7 @@ from torchdic import (
     Volume,
     image,
 )
-from torchdic.landing import SidewaysError
-from torchdic.rays import TurnedRaysError
-from torchdic.wave import UnstableError
-from torchdic.wrap_around import WrapAroundWarning
+from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError, WrapAroundWarning
 
 T = TypeVar("T")
 WAVELENGTH, N0 = 0.546, 1.36

@@ -12,7 +12,7 @@ from torch.autograd.functional import jacobian
 
 from data_synthetic import GaussianBall, GradedIndexRod, LayeredMedium
 from torchdic import Fidelity, Grid, Volume
-from torchdic.aberration import CAREFUL, effective_defocus, wavefront
+from torchdic.object_aberration.wavefront import CAREFUL, effective_defocus, wavefront
 
 N0 = 1.36
 DIRECTIONS = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, -0.5], [0.5, -0.7], [1.0, 0.6]], dtype=torch.float64)

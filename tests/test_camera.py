@@ -10,9 +10,10 @@ import torch
 
 from data_synthetic import Bead
 from recon.cli import main
-from recon.config import dump, load
-from recon.reconstruct import load_data
-from recon.simulate import exact_images
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.run.exact_images import exact_images
+from recon.run.reconstruct import load_data
 from torchdic import (
     Acquisition,
     Camera,
@@ -26,7 +27,7 @@ from torchdic import (
     image,
     image_field,
 )
-from torchdic.tiff import read_stack
+from torchdic.files.stack import read_stack
 
 
 def seeded(seed=0):

@@ -7,11 +7,14 @@ import pytest
 import torch
 
 from data_synthetic import GaussianBall
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, landing
-from torchdic.caustics import Tubes, tubes_that_may_fold
-from torchdic.landing import MARGIN, ray_field
-from torchdic.rays import deviation, launch
-from torchdic.wave import split_step, to_field
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+from torchdic.plane_waves import to_field
+from torchdic.propagation import bent_rays
+from torchdic.propagation.bent_rays import ray_field
+from torchdic.propagation.wave import split_step
+from torchdic.rays.caustics import Tubes, tubes_that_may_fold
+from torchdic.rays.mesh import MARGIN
+from torchdic.rays.trace import deviation, launch
 
 N0 = 1.5
 AXIAL = torch.zeros(1, 2, dtype=torch.float64)
@@ -143,7 +146,7 @@ def test_image_of_a_ball_that_focuses_inside_the_volume_is_the_waves(monkeypatch
 
     waves = of(Fidelity("wave"))
     error = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
-    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
+    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: None)
     without = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
     assert float(error.max()) < 0.01
     assert float(without.min()) > 0.5
@@ -248,7 +251,7 @@ def test_looking_changes_no_bit_where_nothing_folds(monkeypatch, smooth_field, d
         return field, gradient
 
     plain = of()
-    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda volume, *_: Tubes(volume.grid, 1.0))
+    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda volume, *_: Tubes(volume.grid, 1.0))
     found = of()
     assert torch.equal(found[0], plain[0])
     # slabs' gradients are added up in another order

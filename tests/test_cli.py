@@ -11,7 +11,7 @@ import tifffile
 import tomli_w
 
 from recon.cli import SPECIMENS, main
-from torchdic.tiff import read_stack, write_stack
+from torchdic.files.stack import read_stack, write_stack
 
 CONFIG = """
 [volume]
@@ -395,7 +395,7 @@ def test_light_that_cannot_be_followed_is_one_line_and_exit_code_2(run, write, p
     [(2000, "2 arrays of 4×14×12 voxels"), (10_000, "2 prism settings × 3 focus planes of 4×14×12 voxels")],
 )
 def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkeypatch, free, wanted):
-    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: free)
+    monkeypatch.setattr("torchdic.memory.free.free_bytes", lambda _device: free)
     line = refused("simulate", write())
     assert wanted in line
     assert "GiB are free" in line
@@ -411,7 +411,7 @@ def test_a_reconstruction_without_room_is_refused_before_it_begins(
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())
-    monkeypatch.setattr("torchdic.memory.free_bytes", lambda _device: free)
+    monkeypatch.setattr("torchdic.memory.free.free_bytes", lambda _device: free)
     line = refused("reconstruct", write({"reconstruction.start": start}))
     assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before

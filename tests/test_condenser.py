@@ -7,7 +7,7 @@ import torch
 
 from data_synthetic import GaussianBall
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.condenser import disc_quadrature
+from torchdic.instrument.condenser import disc_quadrature
 
 
 def disc_mean(p, q):

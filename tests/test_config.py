@@ -7,9 +7,11 @@ import pytest
 import tomli_w
 import torch
 
-from recon.bounds import Bounds
-from recon.config import Config, ConfigError, UnitsWarning, VolumeSection, dump, flat, load
-from recon.descend import Recipe
+from recon.config.conversion import dump, flat
+from recon.config.reading import load
+from recon.config.schema import Config, ConfigError, UnitsWarning, VolumeSection
+from recon.fit.bounds import Bounds
+from recon.fit.descent import Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
 
 CONTRACT = """

@@ -2,7 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.config import dump, load
+from recon.config.conversion import dump
+from recon.config.reading import load
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 FILES = sorted(EXPERIMENTS.glob("*.toml"))

@@ -25,11 +25,10 @@ from torchdic import (
     foreseen,
     image,
     imaging,
-    landing,
 )
-from torchdic.caustics import Tubes
-from torchdic.sampling import SliceSampler
-from torchdic.space_variant import object_levels
+from torchdic.object_aberration.levels import object_levels
+from torchdic.rays.caustics import Tubes
+from torchdic.specimen.interpolation import SliceSampler
 
 N0 = 1.36
 SLICES, ROWS, COLUMNS = 5, 24, 30
@@ -62,7 +61,7 @@ def counted(monkeypatch):
         watch(torch.fft, name)
     for name in ("sample", "value"):
         watch(SliceSampler, name)
-    watch(landing, "tube_area")
+    watch(bent_rays, "tube_area")
 
     def count(function):
         calls.clear()
@@ -351,7 +350,7 @@ def test_caustics_are_not_counted_where_a_bound_rules_them_out(delta, counted, m
     """Rays through a smooth specimen are followed from face to face as if there were no such thing."""
     function = taking(delta, propagation="rays")
     cost, most, images = counted(function), peak(function), function()
-    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
+    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: None)
     assert counted(function) == cost
     assert torch.equal(function(), images)
     assert peak(function) == most
@@ -365,7 +364,7 @@ def test_counting_caustics_takes_neither_transforms_nor_evaluations(delta, count
     looked = []
     look = Tubes.__call__
     monkeypatch.setattr(Tubes, "__call__", lambda self, state: looked.append(1) or look(self, state))
-    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: Tubes(GRID, 1.0))
+    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: Tubes(GRID, 1.0))
     assert counted(plain) == cost
     assert len(looked) == SLICES
     assert torch.equal(plain(), images)

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from data_synthetic import GaussianBall
-from recon import checkpoint
-from recon.bounds import Bounds
-from recon.checkpoint import Checkpoint, CheckpointError
-from recon.descend import Recipe, descend
-from recon.metrics import mean_inside, residual_rms, volume_error
-from recon.regularisers import total_variation
+from recon.fit.bounds import Bounds
+from recon.fit.descent import Recipe, descend
+from recon.fit.prior import total_variation
+from recon.report.metrics import mean_inside, residual_rms, volume_error
+from recon.run import checkpoint
+from recon.run.checkpoint import Checkpoint, CheckpointError
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BACKGROUND = 1.5

@@ -7,7 +7,7 @@ import pytest
 import torch
 from distant import DISTANT, Device, bring, send
 
-from recon.descend import Recipe, descend
+from recon.fit.descent import Recipe, descend
 from torchdic import (
     Acquisition,
     Camera,

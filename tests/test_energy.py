@@ -12,11 +12,12 @@ import pytest
 import torch
 
 from data_synthetic import GaussianBall
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Prism, Volume, image, landing
-from torchdic.landing import ray_field
-from torchdic.microscope import propagate
-from torchdic.rays import axial_momentum, deviation, launch
-from torchdic.wave import axial_difference
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Prism, Volume, image
+from torchdic.forward.images import propagate
+from torchdic.plane_waves import axial_difference, axial_momentum
+from torchdic.propagation import bent_rays
+from torchdic.propagation.bent_rays import ray_field
+from torchdic.rays.trace import deviation, launch
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -109,7 +110,7 @@ def test_flux_through_a_face_behind_a_focus_is_the_incoming_one(monkeypatch):
     """
     # A² instead of A·exp(ikW), and p_z/p_z0 divided out: 1/|det| is A²p_z/p_z0. On the face nothing is extended.
     monkeypatch.setattr(torch, "polar", lambda amplitude, phase: torch.complex(amplitude.square(), 0 * phase))
-    monkeypatch.setattr(landing, "axial_momentum", lambda n0, p: torch.ones_like(p[..., 0]))
+    monkeypatch.setattr(bent_rays, "axial_momentum", lambda n0, p: torch.ones_like(p[..., 0]))
     momentum = torch.tensor([[0.0, 0.0], [0.12, -0.16]], dtype=torch.float64)
     for n in (30, 60, 90):
         volume = leaving(n, 0.11, 7.0)

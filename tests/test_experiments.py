@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.tiff import read_volume, write_stack
+from torchdic.files.stack import read_volume, write_stack
 
 SCRIPT = Path(__file__).parents[1] / "experiments" / "measured.py"
 SHAPE = (200, 256)

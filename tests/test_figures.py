@@ -5,11 +5,11 @@ from matplotlib import image as pictures
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from recon import figures
-from recon.compare import Trial, compare, table
-from recon.descend import Recipe
+from recon.fit.descent import Recipe
+from recon.report import figures
+from recon.report.comparison import Trial, compare, table
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.tiff import read_volume
+from torchdic.files.stack import read_volume
 
 GRID = Grid((4, 9, 12), (0.5, 0.2, 0.25))
 PRISMS = (Prism((0.0, 0.24), 1.5), None, Prism((0.24, 0.0), -1.2))

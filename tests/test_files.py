@@ -4,7 +4,7 @@ import stat
 
 import pytest
 
-from torchdic.files import write_json, write_text, written_whole
+from torchdic.files.whole import write_json, write_text, written_whole
 
 
 def test_a_file_appears_whole_at_the_end(tmp_path):

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchdic import Fidelity, Grid, Volume
-from torchdic.microscope import propagate
-from torchdic.wave import axial_difference, exp_i, to_field
+from torchdic.forward.images import propagate
+from torchdic.plane_waves import axial_difference, exp_i, to_field
 
 
 @pytest.fixture(scope="module")

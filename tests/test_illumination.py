@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from data_synthetic import Bead
-from recon.config import ConfigError, dump, load
-from recon.simulate import exact_images
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.config.schema import ConfigError
+from recon.run.exact_images import exact_images
 from torchdic import (
     Acquisition,
     Camera,
@@ -24,9 +26,9 @@ from torchdic import (
     image,
     image_field,
 )
-from torchdic.microscope import propagate
-from torchdic.wave import axial_difference, exp_i, to_field
-from torchdic.weak import linear_image
+from torchdic.forward.images import propagate
+from torchdic.linear import linear_image
+from torchdic.plane_waves import axial_difference, exp_i, to_field
 
 N0 = 1.36
 POINTS = torch.tensor([[0.0, 0.0], [0.31, -0.12], [-0.17, 0.24]], dtype=torch.float64)

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from data_synthetic import GaussianBall
-from recon.initial import linear_start
-from recon.metrics import volume_error
+from recon.fit.start import linear_start
+from recon.report.metrics import volume_error
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BACKGROUND = 1.5

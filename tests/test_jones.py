@@ -6,7 +6,9 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from recon.config import ConfigError, dump, load
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.config.schema import ConfigError
 from torchdic import (
     Acquisition,
     Condenser,
@@ -21,7 +23,7 @@ from torchdic import (
     image_field,
     jones,
 )
-from torchdic.weak import linear_image
+from torchdic.linear import linear_image
 
 F64 = torch.float64
 ANGLES = torch.linspace(-2.0, 2.2, 9, dtype=F64)

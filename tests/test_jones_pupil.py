@@ -9,7 +9,9 @@ import torch
 from scipy.special import spherical_jn, spherical_yn
 
 from data_synthetic.ball import GaussianBall
-from recon.config import ConfigError, dump, load
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.config.schema import ConfigError
 from torchdic import (
     Acquisition,
     Condenser,
@@ -25,8 +27,8 @@ from torchdic import (
     image_field,
     jones,
 )
-from torchdic.jones_pupil import diattenuating, product, retarding, turn
-from torchdic.weak import linear_image
+from torchdic.instrument.polarised_lenses import diattenuating, product, retarding, turn
+from torchdic.linear import linear_image
 
 F64 = torch.float64
 GRID = Grid((1, 12, 15), (1.0, 0.2, 0.21))

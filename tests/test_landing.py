@@ -7,8 +7,9 @@ import torch
 
 from data_synthetic import GaussianBall
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, launch
-from torchdic.landing import MARGIN, _crossed, _Mesh, extend, ray_field, tube_area
-from torchdic.rays import Deviation, deviation
+from torchdic.propagation.bent_rays import extend, ray_field, tube_area
+from torchdic.rays.mesh import MARGIN, Mesh, crossed_caustics
+from torchdic.rays.trace import Deviation, deviation
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -17,7 +18,7 @@ GRID = Grid((1, 13, 18), (1.0, 0.2, 0.25))
 
 def coverage(grid, displacement):
     """How many triangles cover each pixel, (source, y, x), and with what sum of orientations."""
-    mesh = _Mesh(grid, displacement)
+    mesh = Mesh(grid, displacement)
     source, triangle, pixel = mesh.covered(displacement)
     edges = mesh.edges(displacement)[source, triangle]
     sign = torch.sign(edges[:, 0, 1] * edges[:, 1, 0] - edges[:, 0, 0] * edges[:, 1, 1])
@@ -130,8 +131,8 @@ def test_caustics_on_a_straight_way_are_where_a_tubes_area_vanishes(leaving, lan
         y, x = scale
         return torch.tensor([[[[0.0, 1.0 * x], [1.0 * y, 0.0]]]], dtype=torch.float64)
 
-    assert float(_crossed(edges(leaving), edges(landed))) == caustics
-    assert float(_crossed(edges(landed), edges(leaving))) == caustics
+    assert float(crossed_caustics(edges(leaving), edges(landed))) == caustics
+    assert float(crossed_caustics(edges(landed), edges(leaving))) == caustics
 
 
 def test_extension_there_and_back_is_nothing():

@@ -20,7 +20,7 @@ from torchdic import (
     image,
     image_field,
 )
-from torchdic.microscope import propagate
+from torchdic.forward.images import propagate
 
 WAVELENGTH = 0.546
 N0 = 1.36

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, image, image_field
-from torchdic.volume import Volume
-from torchdic.weak import transfer_function
+from torchdic.linear import transfer_function
+from torchdic.specimen.volume import Volume
 
 N0, WAVELENGTH = 1.5, 0.546
 PRISMS = (Prism((0.05, 0.21), 1.1), None, Prism((0.17, -0.04), -0.7))

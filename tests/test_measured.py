@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from recon.measured import background_surface, noise_level, prepare
-from recon.shear_axis import estimate_shear_axis
-from torchdic.tiff import Stack, StackError, StackWarning, read_stack, write_stack
+from recon.recording.background import background_surface, noise_level
+from recon.recording.preparation import prepare
+from recon.recording.shear_axis import estimate_shear_axis
+from torchdic.errors import StackError, StackWarning
+from torchdic.files.stack import Stack, read_stack, write_stack
 
 RIGHT = math.pi / 2
 

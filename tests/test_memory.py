@@ -23,9 +23,8 @@ from torchdic import (
     foreseen,
     image,
     image_field,
-    memory,
 )
-from torchdic.precision import peak_bytes
+from torchdic.planning.work_precision import peak_bytes
 
 GRID = Grid((7, 26, 30), (0.3, 0.2, 0.21))
 N0 = 1.36

@@ -4,10 +4,10 @@ from itertools import pairwise
 import pytest
 import torch
 
-from recon.bounds import SHARPNESS, Bounds
-from recon.misfit import gaussian, spatial_variance
-from recon.regularisers import SMOOTHING, magnitude, total_variation
-from recon.schedule import cosine, held_then_annealed
+from recon.fit.bounds import SHARPNESS, Bounds
+from recon.fit.misfit import gaussian, spatial_variance
+from recon.fit.prior import SMOOTHING, magnitude, total_variation
+from recon.fit.schedule import cosine, held_then_annealed
 
 BOUNDS = {
     "free": Bounds(None, None),

@@ -21,8 +21,9 @@ from torchdic import (
     image_field,
     thin_lens,
 )
-from torchdic.objective import apodise, zernike
-from torchdic.weak import linear_image
+from torchdic.instrument.objective import apodise
+from torchdic.instrument.zernike import zernike
+from torchdic.linear import linear_image
 
 # Noll's table, as published, with unit rms over the disc; θ from +x towards +y
 NOLL = {

@@ -21,7 +21,7 @@ from torchdic import (
     image_field,
     imaging,
 )
-from torchdic.passband import Passband, interpolate
+from torchdic.imaging.passband import Passband, interpolate
 
 WAVELENGTH, NA, N0 = 0.546, 0.75, 1.36
 POINTS = torch.tensor([[0.0, 0.0], [0.31, -0.12], [-0.7, 0.24], [0.05, -0.74]], dtype=torch.float64)

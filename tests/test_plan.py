@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from data_synthetic import Bead, CellPhantom, GaussianBall
-from recon import reconstruct
 from recon.cli import main
-from recon.config import dump, load
-from recon.planned import GROWTH, current, follow, strength
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.fit.planned import GROWTH, current, follow, strength
+from recon.run import reconstruct
 from torchdic import (
     REFERENCE,
     Acquisition,
@@ -36,13 +37,12 @@ from torchdic import (
     pilots,
     plan,
 )
-from torchdic.cost import work
-from torchdic.image_error import FLOOR, image_error
-from torchdic.ladders import MARGIN, way_ladder
-from torchdic.plan import describe
-from torchdic.tiff import read_volume
-from torchdic.wave import UnstableError
-from torchdic.wrap_around import WrapAroundWarning
+from torchdic.errors import UnstableError, WrapAroundWarning
+from torchdic.files.stack import read_volume
+from torchdic.planning.cost import work
+from torchdic.planning.image_error import FLOOR, image_error
+from torchdic.planning.ladders import MARGIN, way_ladder
+from torchdic.planning.plan import describe
 
 GRID = Grid((16, 48, 48), (0.4, 0.2, 0.2))
 MICROSCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))

@@ -15,9 +15,10 @@ import torch
 
 from data_synthetic import Bead, GaussianBall
 from recon.cli import main
-from recon.config import converter, dump, load
-from recon.fronts import as_dict, draw_fronts, write_csv
-from recon.simulate import exact_images
+from recon.config.conversion import converter, dump
+from recon.config.reading import load
+from recon.report.fronts import as_dict, draw_fronts, write_csv
+from recon.run.exact_images import exact_images
 from torchdic import (
     Acquisition,
     Candidate,
@@ -32,9 +33,9 @@ from torchdic import (
     image,
     work_precision,
 )
-from torchdic.files import write_json
-from torchdic.image_error import FLOOR, image_error
-from torchdic.precision import (
+from torchdic.files.whole import write_json
+from torchdic.planning.image_error import FLOOR, image_error
+from torchdic.planning.work_precision import (
     converged_fidelities,
     gradient_error,
     ladder,

@@ -8,7 +8,7 @@ import torch
 from scipy.special import j1
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
-from torchdic.prism import MATERIALS
+from torchdic.instrument.prism import MATERIALS
 
 GRID = Grid((1, 8, 9), (1.0, 0.2, 0.3))
 

@@ -7,7 +7,7 @@ import torch
 
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
-from torchdic.projection import project
+from torchdic.propagation.projection import project
 
 N0 = 1.36
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.landing import SidewaysError
-from torchdic.rays import TurnedRaysError
-from torchdic.wave import MOST_ENERGY, UnstableError
+from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
+from torchdic.propagation.wave import MOST_ENERGY
 
 REFUSALS = (TurnedRaysError, SidewaysError, UnstableError)
 everywhere = pytest.mark.parametrize("propagation", ["projection", "rays", "wave"])

@@ -8,11 +8,11 @@ import torch
 from torchdiffeq import odeint
 
 from torchdic import Fidelity, Grid
-from torchdic.ray_equation import RayEquation
-from torchdic.ray_solver import TABLEAUX, solve
-from torchdic.rays import kept_by_rays
-from torchdic.recompute import recompute
-from torchdic.sampling import SliceSampler, spline_coefficients
+from torchdic.memory.batches import recompute
+from torchdic.rays.equation import RayEquation
+from torchdic.rays.solver import TABLEAUX, solve
+from torchdic.rays.trace import kept_by_rays
+from torchdic.specimen.interpolation import SliceSampler, spline_coefficients
 
 GRID = Grid((5, 7, 6), (0.5, 0.3, 0.4))
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from recon.cli import main
-from recon.config import load
-from recon.reconstruct import load_data, reconstruct
-from torchdic.tiff import read_stack
+from recon.config.reading import load
+from recon.run.reconstruct import load_data, reconstruct
+from torchdic.files.stack import read_stack
 
 README = Path(__file__).parents[1] / "README.md"
 

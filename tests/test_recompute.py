@@ -5,7 +5,8 @@ import warnings
 import pytest
 import torch
 
-from torchdic.recompute import BatchWarning, recompute, replay, slabs, sum_over_sources
+from torchdic.errors import BatchWarning
+from torchdic.memory.batches import recompute, replay, slabs, sum_over_sources
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 10, 17, 100])

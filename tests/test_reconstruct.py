@@ -20,13 +20,14 @@ import torch
 from matplotlib import image as pictures
 
 from data_synthetic import GaussianBall
-from recon import figures, reconstruct
 from recon.cli import main
-from recon.config import load
-from recon.metrics import volume_error
-from recon.misfit import gaussian, spatial_variance
+from recon.config.reading import load
+from recon.fit.misfit import gaussian, spatial_variance
+from recon.report import figures
+from recon.report.metrics import volume_error
+from recon.run import reconstruct
 from torchdic import Grid, Volume, image
-from torchdic.tiff import read_stack, read_volume, write_stack
+from torchdic.files.stack import read_stack, read_volume, write_stack
 
 GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
 CONFIG = {

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Fidelity, Grid, Prism, Volume, image
-from torchdic.sampling import SliceSampler, depth_weights, shares, spline_coefficients, window
+from torchdic.specimen.interpolation import SliceSampler, depth_weights, shares, spline_coefficients, window
 
 GRID = Grid((6, 9, 11), (0.5, 0.2, 0.3))
 BOTH = pytest.mark.parametrize("interpolation", ["linear", "cubic"])

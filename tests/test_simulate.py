@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from data_synthetic import Bead
-from recon.simulate import exact_images
+from recon.run.exact_images import exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 # off the centre, odd and even: a swapped axis or a crop one pixel off shows

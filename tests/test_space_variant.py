@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.aberration import CAREFUL, effective_defocus
-from torchdic.space_variant import MOST_LEVELS, kept_by_levels, levels, object_levels
-from torchdic.wave import axial_difference, exp_i
+from torchdic.object_aberration.levels import MOST_LEVELS, kept_by_levels, levels, object_levels
+from torchdic.object_aberration.wavefront import CAREFUL, effective_defocus
+from torchdic.plane_waves import axial_difference, exp_i
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -250,7 +250,9 @@ def test_gradient_is_the_central_difference(smooth_field, fidelity, start):
 def test_gradient_goes_through_the_map_too(smooth_field, monkeypatch):
     delta = smooth_field(GRID, 0.03).requires_grad_()
     (whole,) = torch.autograd.grad(total(Volume(GRID, delta, N0), LINEAR), delta)
-    monkeypatch.setattr("torchdic.space_variant.effective_defocus", lambda *a, **k: effective_defocus(*a, **k).detach())
+    monkeypatch.setattr(
+        "torchdic.object_aberration.levels.effective_defocus", lambda *a, **k: effective_defocus(*a, **k).detach()
+    )
     (cut,) = torch.autograd.grad(total(Volume(GRID, delta, N0), LINEAR), delta)
     assert float((whole - cut).abs().max()) > 0.01 * float(whole.abs().max())
 

@@ -6,7 +6,7 @@ from torch import nn
 
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Microscope, Volume, image
-from torchdic.instrument import Acquisition
+from torchdic.instrument.microscope import Acquisition
 
 GRID = Grid((5, 6, 7), (0.4, 0.2, 0.3))
 

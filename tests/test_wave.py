@@ -9,7 +9,9 @@ import torch
 
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
-from torchdic.wave import SlabWarning, UnstableError, axial_difference, slab_mean, split_step, to_field, to_spectrum
+from torchdic.errors import SlabWarning, UnstableError
+from torchdic.plane_waves import axial_difference, to_field, to_spectrum
+from torchdic.propagation.wave import slab_mean, split_step
 
 N0 = 1.36
 WAVELENGTH = 0.546

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
-from torchdic.weak import linear_image, transfer_function, transfer_functions, two_beam_image
+from torchdic.linear import linear_image, transfer_function, transfer_functions, two_beam_image
 
 N0 = 1.36
 PRISMS = (Prism((0.05, 0.21), 1.1), Prism((0.17, -0.04), -0.7), Prism((0.24, 0.0), math.pi / 2), None)

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
-from torchdic.wrap_around import UNREMARKED, WrapAroundWarning
+from torchdic.errors import WrapAroundWarning
+from torchdic.imaging.wrap_around import UNREMARKED
 
 GRID = Grid((3, 24, 20), (0.4, 0.25, 0.25))
 MICROSCOPE = Microscope(0.546, Objective(0.5), Condenser(0.2, torch.tensor([[0.0, 0.0], [0.1, -0.15]])))

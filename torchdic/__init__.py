@@ -9,22 +9,24 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
-from torchdic.camera import Camera
-from torchdic.condenser import Condenser, Spectrum
-from torchdic.effects import Effect
+from torchdic.errors import SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
+from torchdic.forward.foresee import Foreseen, foreseen
+from torchdic.forward.images import image, image_field
 from torchdic.grid import Grid
-from torchdic.instrument import Acquisition, Microscope, SamplingWarning
-from torchdic.jones import Polarisation
-from torchdic.jones_pupil import JonesPupil
-from torchdic.memory import Foreseen, ShortOfMemoryError, foreseen
-from torchdic.microscope import image, image_field
-from torchdic.objective import Layer, Objective, ThinLens, thin_lens
-from torchdic.plan import Plan, ToleranceWarning, plan
-from torchdic.precision import Candidate, Trial, work_precision
-from torchdic.prism import Prism
-from torchdic.rays import Rays, launch, trace
-from torchdic.volume import Volume
+from torchdic.instrument.camera import Camera
+from torchdic.instrument.condenser import Condenser, Spectrum
+from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.instrument.objective import Layer, Objective
+from torchdic.instrument.polarisation import Polarisation
+from torchdic.instrument.polarised_lenses import JonesPupil
+from torchdic.instrument.prism import Prism
+from torchdic.instrument.thin_lens import ThinLens, thin_lens
+from torchdic.planning.effects import Effect
+from torchdic.planning.plan import Plan, plan
+from torchdic.planning.work_precision import Candidate, Trial, work_precision
+from torchdic.rays.trace import Rays, launch, trace
+from torchdic.specimen.volume import Volume
 
 __all__ = [
     "DRAFT",

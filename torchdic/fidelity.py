@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from torchdic.sampling import Interpolation
+from torchdic.specimen.interpolation import Interpolation
 
 Propagation = Literal["projection", "rays", "wave"]
 Solver = Literal["euler", "midpoint", "rk4", "bosh3", "dopri5", "dopri8"]

@@ -1,0 +1,99 @@
+"""Configuration files: TOML whose schema is the domain's own dataclasses.
+
+Unknown keys, wrong types and unphysical values are errors that name the file, the key, the value and the law.
+"""
+
+import dataclasses
+import difflib
+import math
+import os
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any, TypeVar
+
+from cattrs import transform_error
+from cattrs.errors import ForbiddenExtraKeysError
+
+from recon.config.conversion import converter
+from recon.config.schema import Config, ConfigError, UnitsWarning
+
+T = TypeVar("T")
+
+
+def load(path: str | os.PathLike[str]) -> Config:
+    """Read a configuration file; relative paths in it start from its folder.
+
+    Raises ConfigError. Warns UnitsWarning of a bias beyond a whole turn and of a shear longer than the volume is wide,
+    as they are in degrees and nm.
+    """
+    path = Path(path)
+    try:
+        text = path.read_bytes().decode("utf-8")
+        values = tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not TOML: {error}") from error
+    config = structure(values, Config, str(path))
+    if config.data is not None:
+        data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
+        config = dataclasses.replace(config, data=data)
+    _warn_of_other_units(config, path)
+    return config
+
+
+def _warn_of_other_units(config: Config, path: Path) -> None:
+    widest = max(config.volume.grid.extent[1:])
+    for index, prism in enumerate(config.acquisition.prisms):
+        if prism is None:
+            continue
+        named = f"{path}: acquisition.prisms[{index}]"
+        shear, bias = math.hypot(*map(float, prism.shear)), float(prism.bias)
+        if abs(bias) > 2 * math.pi:
+            warnings.warn(f"{named}.bias: {bias:g} is more than a turn; angles are in rad", UnitsWarning, stacklevel=3)
+        if shear > widest:
+            warnings.warn(
+                f"{named}.shear: {shear:g} is longer than the volume's {widest:g} µm; lengths are in µm",
+                UnitsWarning,
+                stacklevel=3,
+            )
+
+
+def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
+    """A dataclass from plain values. Raises ConfigError that names `source` and the key (below `where`)."""
+    try:
+        return converter.structure(values, kind)
+    except Exception as error:
+        problem = _first_problem(error, where)
+        if problem is None:
+            raise
+        raise ConfigError(f"{source}: {problem}") from error
+
+
+def _first_problem(error: Exception, where: str) -> str | None:
+    """What is wrong, with its key: an unknown one before what it left missing. None for an error not about values."""
+    problems = []
+    for line in transform_error(error, path=where or "$", format_exception=_describe):
+        message, _, path = line.rpartition(" @ ")
+        key = path.removeprefix("$").removeprefix(".")
+        if message.startswith("unknown key "):
+            name = message.removeprefix("unknown key ")
+            problems.insert(0, f"unknown key {key}.{name}" if key else f"unknown key {name}")
+        elif message == "missing key":
+            problems.append(f"missing key {key}")
+        elif message:
+            problems.append(f"{key}: {message}" if key else message)
+    return problems[0] if problems else None
+
+
+def _describe(error: BaseException, _: Any) -> str:
+    if isinstance(error, ForbiddenExtraKeysError):
+        name = min(error.extra_fields)
+        known = [f.name for f in dataclasses.fields(error.cl)]
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
+        return f"unknown key {name}; {hint}"
+    if isinstance(error, KeyError):
+        return "missing key"
+    return str(error)

@@ -1,0 +1,54 @@
+"""Where a reconstruction begins: the weak specimen that explains the data linearly."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.misfit import spatial_variance
+from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume
+from torchdic.linear import linear_image, transfer_functions
+
+# Tikhonov weight relative to the mean response.
+DAMPING = 0.03
+
+
+def bytes_of_linear_start(grid: Grid, acquisition: Acquisition, itemsize: int) -> int:
+    """What `linear_start` holds at once, but for its transfer functions' sources, which go in batches.
+
+    The transfer functions and their normal equations, with what is made of them: 4.6 and 8.5 values each, as measured.
+    """
+    slices, *sides = grid.shape
+    images = len(acquisition.prisms) * len(acquisition.focus)
+    return math.ceil((4.6 * images + 8.5 * slices) * slices * math.prod(sides) * itemsize)
+
+
+@torch.no_grad()
+def linear_start(
+    data: Float[Tensor, "prism focus y x"],
+    grid: Grid,
+    background: float,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    sources: int = 24,
+) -> Float[Tensor, "z y x"]:
+    """Δn that the model's linear response at Δn = 0 finds behind the data; 0 where it has none, as with bias 0 alone.
+
+    Frequency by frequency, a damped least-squares problem of the size of the number of slices is solved with the wave's
+    transfer function.
+    """
+    fidelity = Fidelity("wave", sources=sources)
+    empty = Volume(grid, data.new_zeros(grid.shape), background)
+    weights = spatial_variance(data).rsqrt()[:, None, None, None]
+    transfer = transfer_functions(
+        grid, microscope, acquisition, background, fidelity, dtype=data.dtype, device=data.device
+    )
+    H = (weights[..., None] * transfer).flatten(0, 1).permute(2, 3, 0, 1)  # (y, x, prism·focus, z)
+    deviation = data - linear_image(empty, microscope, acquisition, fidelity)
+    d = torch.fft.fft2(weights * deviation).flatten(0, 1).permute(1, 2, 0)[..., None]
+    normal = H.mH @ H
+    scale = normal.diagonal(dim1=-2, dim2=-1).real.mean().clamp_min(torch.finfo(data.dtype).tiny)
+    damped = normal / scale + DAMPING * torch.eye(grid.shape[0], dtype=data.dtype, device=data.device)
+    spectrum = torch.linalg.solve(damped, H.mH @ d / scale)[..., 0]
+    return torch.fft.ifft2(spectrum.movedim(-1, 0)).real

@@ -1,0 +1,1 @@
+"""A recorded stack brought to the model's unit: checked, flattened and scaled."""

@@ -1,0 +1,1 @@
+"""Figures, tables and numbers that say how a reconstruction went."""

@@ -1,0 +1,188 @@
+"""Pictures of a reconstruction: images beside the model's, sections through the volume, the misfit's way down."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from torch import Tensor
+
+from recon.run.checkpoint import Row
+from torchdic import Grid, Prism
+from torchdic.files.whole import written_whole
+
+DPI = 150
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    with written_whole(path) as partial:
+        figure.savefig(partial, dpi=DPI)
+
+
+def leave(figure: Figure, path: Path) -> int:
+    """Save a script's figure in a folder made for it, and print where it is; returns the script's exit code."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(figure, path)
+    except OSError as error:
+        print(f"{Path(sys.argv[0]).name}: error: {error}", file=sys.stderr)
+        return 2
+    print(path)
+    return 0
+
+
+def draw_images(
+    measured: Float[Tensor, "prism focus y x"],
+    modelled: Float[Tensor, "prism focus y x"],
+    prisms: Sequence[Prism | None],
+    focus: Sequence[float | Tensor],
+    grid: Grid,
+) -> Figure:
+    """Measured, modelled and residual images, a row for each prism at its middle focus plane."""
+    planes = sorted({len(focus) // 4, len(focus) // 2, (3 * len(focus)) // 4})
+    aspect = grid.extent[1] / grid.extent[2]
+    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
+    axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
+    residual = measured - modelled
+    largest = float(residual[:, planes].abs().max())
+    for p, prism in enumerate(prisms):
+        low, high = float(measured[p].min()), float(measured[p].max())
+        for k, f in enumerate(planes):
+            trio = axes[p, 3 * k : 3 * k + 3]
+            for ax, stack, name in zip(
+                trio, (measured, modelled, residual), ("measured", "modelled", "residual"), strict=True
+            ):
+                limits = (-largest, largest) if stack is residual else (low, high)
+                cmap = "RdBu_r" if stack is residual else "gray"
+                shown = _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
+                if p == 0:
+                    ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
+                if ax is axes[p, 0]:
+                    ax.set_ylabel(_caption(prism), fontsize=8)
+                if ax is trio[-1] and ax is axes[p, -1]:
+                    figure.colorbar(shown, ax=ax, label="residual")
+            _scale_bar(trio[0], grid.extent[2], "white")
+    return figure
+
+
+def draw_sections(
+    volumes: Mapping[str, Float[Tensor, "z y x"]], grid: Grid, planes: Sequence[str] = ("xy", "xz", "yz")
+) -> Figure:
+    """Sections through the first volume's centre of |Δn|: a column for each volume, a row for each plane, one scale."""
+    through = _centre(next(iter(volumes.values())))
+    top = max(float(v.max()) for v in volumes.values())
+    bottom = min(0.0, *(float(v.min()) for v in volumes.values()))
+    size = dict(zip("zyx", grid.extent, strict=True))
+    heights = [size[name[1]] for name in planes]
+    widest = max(size[name[0]] for name in planes)
+    figure = Figure(
+        figsize=(2.4 * len(volumes) + 1.2, 2.4 * sum(heights) / widest + 0.35 * len(planes) + 0.2),
+        layout="constrained",
+    )
+    axes = figure.subplots(len(planes), len(volumes), squeeze=False, height_ratios=heights)
+    shown = None
+    for column, (title, volume) in zip(axes.T, volumes.items(), strict=True):
+        for ax, name in zip(column, planes, strict=True):
+            section = {"xy": volume[through[0]], "xz": volume[:, through[1]], "yz": volume[:, :, through[2]]}[name]
+            spacing = [grid.spacing["zyx".index(letter)] for letter in (name[1], name[0])]
+            shown = _show(ax, section, spacing, "viridis", (bottom, top))
+            ax.set_xlabel(name[0], fontsize=8, labelpad=1)
+            ax.set_ylabel(name[1], fontsize=8, labelpad=1)
+            _scale_bar(ax, size[name[0]], "white")
+        column[0].set_title(title, fontsize=9)
+    assert shown is not None
+    figure.colorbar(shown, ax=axes, label="Δn")
+    return figure
+
+
+def draw_misfit(rows: Sequence[Row]) -> Figure:
+    """The misfit over the steps, on a logarithmic scale."""
+    figure = Figure(figsize=(5, 3), layout="constrained")
+    ax = figure.subplots()
+    ax.semilogy([row[0] for row in rows], [row[1] for row in rows])
+    ax.set_xlabel("step")
+    ax.set_ylabel("misfit (1 = empty volume's)")
+    ax.grid(alpha=0.3, which="both")
+    return figure
+
+
+def draw_stack(
+    stack: Float[Tensor, "prism focus y x"],
+    prisms: Sequence[Prism | None],
+    focus: Sequence[float | Tensor],
+    spacing: tuple[float, float],
+) -> Figure:
+    """A stack's images, a row for each prism on one scale of grey; at most seven focus planes, evenly chosen."""
+    planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), 7)).round().astype(int))
+    aspect = stack.shape[2] * spacing[0] / (stack.shape[3] * spacing[1])
+    figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
+    axes = figure.subplots(len(prisms), len(planes), squeeze=False)
+    for p, prism in enumerate(prisms):
+        limits = float(stack[p].min()), float(stack[p].max())
+        for ax, f in zip(axes[p], planes, strict=True):
+            _show(ax, stack[p, f], spacing, "gray", limits)
+            if p == 0:
+                ax.set_title(f"focus {float(focus[f]):g} µm", fontsize=8)
+        bar = figure.colorbar(axes[p, 0].images[0], ax=axes[p].tolist(), pad=0.01, aspect=12)
+        bar.set_label("intensity", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+        axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
+        _scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
+    return figure
+
+
+def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: tuple[float, float]):
+    ny, nx = image.shape
+    shown = ax.imshow(
+        image.detach().cpu().numpy(),
+        cmap=cmap,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=(0, nx * spacing[1], ny * spacing[0], 0),
+        interpolation="nearest",
+    )
+    ax.set_xticks([])
+    ax.set_yticks([])
+    return shown
+
+
+def _scale_bar(ax: Axes, width: float, colour: str) -> None:
+    """A bar of about a quarter of the width, 1, 2 or 5 times a power of ten in µm."""
+    power = 10.0 ** np.floor(np.log10(width / 4))
+    length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)
+    bottom, top = ax.get_ylim()
+    height = abs(bottom - top)
+    ax.add_patch(Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0))
+    ax.text(
+        0.05 * width,
+        bottom - 0.09 * height,
+        f"{length:g} µm",
+        color=colour,
+        fontsize=7,
+        ha="left",
+        va="bottom",
+    )
+
+
+def _centre(volume: Tensor) -> tuple[int, int, int]:
+    weight = volume.detach().abs()
+    if float(weight.sum()) == 0:
+        nz, ny, nx = volume.shape
+        return nz // 2, ny // 2, nx // 2
+    places = []
+    for axis in range(3):
+        profile = weight.sum([a for a in range(3) if a != axis])
+        index = np.arange(len(profile))
+        places.append(round(float((profile.cpu().numpy() * index).sum() / profile.sum().item())))
+    return places[0], places[1], places[2]
+
+
+def _caption(prism: Prism | None) -> str:
+    if prism is None:
+        return "bright field"
+    return f"shear ({float(prism.shear[0]):g}, {float(prism.shear[1]):g}) µm\nbias {float(prism.bias):.3g} rad"

@@ -1,0 +1,1 @@
+"""A reconstruction from a configuration to a folder of results."""

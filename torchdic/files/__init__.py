@@ -1,0 +1,1 @@
+"""Recorded stacks and volumes on disk."""

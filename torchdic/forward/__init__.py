@@ -1,0 +1,1 @@
+"""The whole microscope: from a specimen to its images."""

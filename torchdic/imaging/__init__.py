@@ -1,0 +1,1 @@
+"""From a field's spectrum behind the specimen to intensities on the camera."""

@@ -1,0 +1,1 @@
+"""The microscope's parts: illumination, prism, objective, polarisation and camera."""

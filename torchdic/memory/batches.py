@@ -1,0 +1,138 @@
+"""Memory bounded: sources in batches, and intermediate values recomputed where there is no room to keep them."""
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from torchdic.errors import BatchWarning
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Demand:
+    """Values per source and pixel that a stage of the computation holds; 1 is a real number of the volume's dtype.
+
+    alone: at most, where no gradient is wanted. kept: for the backward pass, and each of `steps` steps keeps `step`
+    more. working: at most beside all that is kept. back: at most beside the steps' part alone, while the backward pass
+    takes them back. carried: from slab to slab of steps that are computed again. shared: kept (by each step, if any),
+    however many sources there are. once: at most beside the steps' part, or alone, by one source after
+    the other.
+    """
+
+    alone: float
+    kept: float
+    working: float
+    steps: int = 0
+    step: float = 0
+    back: float = 0
+    carried: float = 0
+    shared: float = 0
+    once: float = 0
+
+    @property
+    def whole(self) -> float:
+        """All that is kept."""
+        return self.kept + self.steps * self.step
+
+
+def indices(dtype: torch.dtype) -> float:
+    """How many values of a dtype an index takes."""
+    return torch.int64.itemsize / dtype.itemsize
+
+
+def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
+    """function(*arguments), whose intermediate values are computed again in the backward pass instead of kept."""
+    if not (when and torch.is_grad_enabled()):
+        return function(*arguments)
+    return checkpoint(  # pyright: ignore[reportReturnType]
+        function,
+        *arguments,
+        use_reentrant=False,
+        preserve_rng_state=False,
+        context_fn=lambda: (nullcontext(), _quietly()),
+    )
+
+
+def replay(function: Callable[..., Tensor], *tensors: Tensor, when: bool) -> Tensor:
+    """As `recompute`, of a function of these tensors alone; no graph is built before the backward pass.
+
+    A graph's nodes are small and lie between the large temporaries, whose memory glibc (2.36) then hardly uses again:
+    to hold 1 GiB, a gradient took 8 from the system.
+    """
+    if not (when and torch.is_grad_enabled()):
+        return function(*tensors)
+    return _Replayed.apply(function, *tensors)  # pyright: ignore[reportReturnType]
+
+
+class _Replayed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+        ctx.function = function
+        ctx.save_for_backward(*tensors)
+        return function(*tensors)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        tensors = [t.detach().requires_grad_(t.requires_grad) for t in ctx.saved_tensors]
+        with torch.enable_grad():
+            result = ctx.function(*tensors)
+        learned = [t for t in tensors if t.requires_grad]
+        bars = iter(torch.autograd.grad(result, learned, result_bar, allow_unused=True))
+        return (None, *(next(bars) if t.requires_grad else None for t in tensors))
+
+
+def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
+    """Steps 0 … steps as consecutive (first, last) ranges: about √steps of them where `split`, or a single one."""
+    count = math.isqrt(steps - 1) + 1 if split else 1
+    edges = [i * steps // count for i in range(count + 1)]
+    yield from pairwise(edges)
+
+
+def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
+    """Σ of function(batch of each tensor) over batches of `size` sources; several are computed again when needed."""
+    if size >= len(per_source[0]):
+        return function(*per_source)
+    batches = zip(*(t.split(size) for t in per_source), strict=True)
+    with _worst_of_each_kind():
+        total = recompute(function, *next(batches), when=True)
+        for batch in batches:
+            total = total + recompute(function, *batch, when=True)
+    return total
+
+
+@contextmanager
+def _worst_of_each_kind() -> Iterator[None]:
+    """Of the BatchWarnings within, only the worst of each kind is given, at the end."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    worst: dict[type[Warning], warnings.WarningMessage] = {}
+    for one in caught:
+        message = one.message
+        if not isinstance(message, BatchWarning):
+            warnings.warn_explicit(message, one.category, one.filename, one.lineno)
+            continue
+        other = worst.setdefault(one.category, one).message
+        assert isinstance(other, BatchWarning)
+        if message.severity > other.severity:
+            worst[one.category] = one
+    for one in worst.values():
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """What is computed again has been warned about."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", BatchWarning)
+        yield

@@ -1,0 +1,1 @@
+"""The specimen's own aberration of each object point (Kagalwala & Kanade, section 3.3)."""

@@ -1,0 +1,148 @@
+"""Space-variant defocus: each object point spreads with the defocus of its own (Kagalwala & Kanade, Eq. 6).
+
+Light of the point x' of the field U at the reference plane reaches the lens as if the point lay nearer by δ(x'):
+    S(f) = Σ_x' U(x')·exp(−2πi f·x')·exp(−i k0 δ(x') q(f)),    q = p_z(f + f_s) − p_z0,
+which is no convolution. The last factor is interpolated between K levels δ_k that span the field's δ,
+    S(f) = Σ_k F[U·w_k](f)·exp(−i k0 δ_k q(f)),    Σ_k w_k = 1:
+the Chebyshev nodes with their Lagrange polynomials w_k(δ), smooth in δ as hat functions are not. Of a phase
+that spans ±b rad the coefficients are Bessel functions, 2|J_j(b)| ≤ 2(b/2)^j/j!, so from K ≥ b on the error is below
+    4·Σ_{j ≥ K} |J_j(b)| ≤ 8·(b/2)^K/K!,    b = k0·max|q|·(δ_max − δ_min)/2.
+K is the least for which that is a rounding: 9 levels for b = 1 in float32, as many as hat functions in steps of
+0.25 rad take, which leave 1 %.
+
+δ is the object's aberration for an axial ray, the same for all sources. It stands in for the amplitude that straight
+rays lack; a field that has it, of rays with their amplitude or of waves, would count it twice.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic.fidelity import Fidelity
+from torchdic.instrument.condenser import Condenser
+from torchdic.instrument.objective import Objective
+from torchdic.memory.batches import Demand
+from torchdic.object_aberration.wavefront import AZIMUTHS, CAREFUL, KEPT_BY_PAIR, KEPT_BY_RAY, RINGS, effective_defocus
+from torchdic.plane_waves import exp_i, to_spectrum
+from torchdic.scalar import number
+from torchdic.specimen.volume import Volume
+
+# Levels at most: light that leaves collimated has δ without bound.
+MOST_LEVELS = 128
+
+# Least phase in rad that the levels span: slopes of a narrower one would drown in its rounding.
+LEAST_SPAN = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Depths δ_k by which object points seem nearer, (level,) in µm, and each point's shares in them, (level, y, x)."""
+
+    defocus: Float[Tensor, " level"]
+    share: Float[Tensor, "level y x"]
+
+    def spread(
+        self,
+        field: Complex[Tensor, "source *component y x"],
+        wavelength: float,
+        difference: Float[Tensor, "source y x"],
+    ) -> Complex[Tensor, "source *component y x"]:
+        """Spectrum of a field whose points spread each with its own defocus; difference: p_z(f + f_s) − p_z0."""
+        k0 = 2 * math.pi / wavelength
+        difference = difference.reshape(len(difference), *[1] * (field.ndim - 3), *difference.shape[1:])
+        parts = (
+            to_spectrum(field * share) * exp_i(-k0 * defocus * difference)
+            for defocus, share in zip(self.defocus, self.share, strict=True)
+        )
+        return sum(parts, start=torch.zeros_like(field))
+
+
+def kept_by_levels(count: int) -> int:
+    """Values per source and pixel that autograd keeps of so many levels for the backward pass."""
+    return 5 * count + 4
+
+
+def demand_of_map(volume: Volume, plane: float, fidelity: Fidelity) -> Demand:
+    """What the map of a volume's own aberration holds, per pixel: it serves all sources."""
+    share = (volume.grid.extent[0] / 2 - plane) / volume.grid.extent[0]
+    steps = math.ceil((fidelity.steps or volume.grid.shape[0]) * share - 1e-9)
+    if fidelity.object_aberration == "cone":
+        rays = 1 + len(RINGS) * AZIMUTHS
+        return Demand(150 * rays, 30 * rays, 0, steps, KEPT_BY_RAY["cubic"] * rays, carried=10 * rays)
+    return Demand(250, 150, 0, steps, KEPT_BY_PAIR, carried=26)
+
+
+def object_levels(
+    volume: Volume,
+    plane: float,
+    wavelength: float,
+    objective: Objective | None,
+    condenser: Condenser | None,
+    momentum: Float[Tensor, "source 2"],
+    fidelity: Fidelity,
+) -> Levels:
+    """Levels of the volume's own aberration at depth `plane` (µm), by the method that the fidelity names.
+
+    The map's rays are those of `CAREFUL`, a cubic spline crossed by rk4, in the fidelity's steps. A cone's half angle
+    is asin(NA_c/n0), a choice of where to look that carries no gradient. Raises ValueError for a cone without a
+    condenser's aperture, and as `effective_defocus` and `levels` do.
+    """
+    n0 = number(volume.background)
+    half_angle = None
+    if fidelity.object_aberration == "cone":
+        na = 0.0 if condenser is None else condenser.na
+        if na == 0:
+            raise ValueError(
+                'object_aberration "cone" takes its half angle from the condenser, whose NA must be above 0'
+            )
+        half_angle = math.asin(min(na / n0, 1.0))
+    careful = replace(CAREFUL, steps=fidelity.steps, memory=fidelity.memory)
+    assert fidelity.object_aberration is not None
+    defocus = effective_defocus(
+        volume, plane, fidelity=careful, method=fidelity.object_aberration, half_angle=half_angle
+    )
+    steepest = float(momentum.detach().norm(dim=-1).max())
+    reach = n0 if objective is None else min(n0, max(objective.na, steepest))
+    # the paraxial difference is the smaller one
+    return levels(defocus, 2 * math.pi / wavelength * (n0 - math.sqrt(n0**2 - reach**2)))
+
+
+def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None = None) -> Levels:
+    """Levels for a field's δ (y, x) in µm, where the phase changes by at most `rate` rad per µm of it.
+
+    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. The levels themselves carry
+    no gradient: but for rounding the field does not depend on them. Raises ValueError where δ is not finite, or asks
+    for more than MOST_LEVELS.
+    """
+    low, high = (float(v) for v in torch.aminmax(defocus.detach()))
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError("object_aberration is without bound: light of some object point leaves the volume collimated")
+    half = max((high - low) / 2, LEAST_SPAN / rate)
+    count = _count(rate * half, tolerance or torch.finfo(defocus.dtype).eps)
+    if count > MOST_LEVELS:
+        raise ValueError(
+            f"object_aberration from {low:.4g} to {high:.4g} µm asks for {count} levels, more than {MOST_LEVELS}: "
+            "light of some object points leaves the volume almost collimated"
+        )
+    angle = math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    centre = (low + high) / 2
+    # Lagrange's polynomial of node k: Σ' (2/K)·T_m(t_k)·T_m(t), the first term halved
+    matrix = 2 / count * torch.cos(angle[:, None] * torch.arange(count))
+    matrix[:, 0] /= 2
+    t = (defocus - centre) / half
+    chebyshev = [torch.ones_like(t), t]
+    for _ in range(count - 2):
+        chebyshev.append(2 * t * chebyshev[-1] - chebyshev[-2])
+    share = torch.tensordot(matrix.to(t), torch.stack(chebyshev), 1)
+    return Levels((centre + half * angle.cos()).to(t), share)
+
+
+def _count(span: float, tolerance: float) -> int:
+    """Levels that interpolate exp(iφ), |φ| ≤ span, to the tolerance; see the module's head."""
+    count = max(2, math.ceil(span))
+    while math.log(8) + count * math.log(span / 2) - math.lgamma(count + 1) > math.log(tolerance):
+        count += 1
+    return count

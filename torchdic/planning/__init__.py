@@ -1,0 +1,1 @@
+"""What accuracy costs: the plan of an image, the worth of each effect, and work against precision."""

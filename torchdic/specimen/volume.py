@@ -1,0 +1,81 @@
+"""The specimen: a learnable refractive index on a grid of voxels."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torchdic.grid import Grid
+from torchdic.scalar import number, scalar
+from torchdic.specimen.interpolation import Interpolation, spline_coefficients
+
+
+class Volume(nn.Module):
+    """A transparent specimen of index n = background + delta on a grid of voxels.
+
+    grid: where the voxels are. delta: Δn, shape (z, y, x); an nn.Parameter is learned, any other tensor keeps its
+    graph, and its dtype and device are those of everything computed from the volume. background: index of the medium
+    around the specimen, a number or a 0-d tensor. absorption: κ ≥ 0 of the complex index n + iκ, shape (z, y, x), or
+    None for a specimen that absorbs nothing.
+    Raises ValueError where a shape is not the grid's, an index is not a positive number, or κ is negative.
+    """
+
+    delta: Float[Tensor, "z y x"]
+    background: Float[Tensor, ""]
+    absorption: Float[Tensor, "z y x"] | None
+
+    def __init__(
+        self,
+        grid: Grid,
+        delta: Tensor,
+        background: float | Tensor,
+        absorption: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        _check_field("delta", delta, grid)
+        if absorption is not None:
+            _check_field("absorption", absorption, grid)
+            if bool((absorption < 0).any()):
+                raise ValueError(f"absorption {float(absorption.detach().min()):g} is negative: κ must be at least 0")
+        index = number(background)
+        if not (index > 0 and index < float("inf")):
+            raise ValueError(f"background {index} must be a refractive index above 0")
+        lowest = index + float(delta.detach().min())
+        if lowest <= 0:
+            raise ValueError(f"index {lowest:g} = background {index:g} + delta must stay above 0")
+        self.grid = grid
+        self._keep("delta", delta)
+        self._keep("background", scalar(background, delta))
+        self._keep("absorption", None if absorption is None else absorption.to(delta))
+
+    def _keep(self, name: str, value: Tensor | None) -> None:
+        if isinstance(value, nn.Parameter):
+            self.register_parameter(name, value)
+        else:
+            self.register_buffer(name, value)
+
+    def sampled(self, interpolation: Interpolation) -> list[Float[Tensor, "z y x"]]:
+        """Δn, and κ if there is any, as a `SliceSampler` wants them: voxels, or a spline's coefficients."""
+        fields = [self.delta] if self.absorption is None else [self.delta, self.absorption]
+        return [spline_coefficients(f) for f in fields] if interpolation == "cubic" else fields
+
+    def mean_plane(self) -> float:
+        """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 where Δn is 0 everywhere.
+
+        Faces count too: a specimen centred between two slices would be out of focus by half a slice otherwise.
+        """
+        weight = self.delta.detach().abs().sum((1, 2), dtype=torch.float64)
+        total = float(weight.sum())
+        if total == 0:
+            return 0.0
+        depth = self.grid.coordinates(0, dtype=torch.float64, device=weight.device)
+        index = round(2 * self.grid.index(0, float((weight * depth).sum()) / total)) / 2
+        return self.grid.centre(0, index)
+
+
+def _check_field(name: str, field: Tensor, grid: Grid) -> None:
+    if tuple(field.shape) != grid.shape:
+        raise ValueError(f"{name} has shape {tuple(field.shape)}, the grid has {grid.shape} (z, y, x)")
+    if not field.is_floating_point():
+        raise ValueError(f"{name} has dtype {field.dtype}: it must be a floating-point tensor")
+    if not bool(torch.isfinite(field).all()):
+        raise ValueError(f"{name} holds {int((~torch.isfinite(field)).sum())} values that are not finite")
