@@ -35,7 +35,6 @@ from torchdic import (
     Trial,
     Volume,
 )
-from torchdic.fidelity import Propagation
 from torchdic.planning.work_precision import ladder, trials
 
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.7))
@@ -91,7 +90,7 @@ def measure(scene: Scene, repeats: int, tried: list[Candidate]) -> Iterator[Tria
     """Trials of the candidates on a scene, one by one."""
     # rays and float32 are held short: their converged answers err by far less than the trials
     slices, margin = scene.grid.shape[0], REFERENCE.padding
-    references: dict[Propagation, Fidelity] = {
+    references: dict[str, Fidelity] = {
         "projection": Fidelity("projection", sources=200, padding=margin),
         "rays": Fidelity("rays", slices // 2, 48, padding=margin // 2),
         "wave": Fidelity("wave", scene.finest * slices, 200, padding=margin),

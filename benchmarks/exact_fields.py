@@ -20,7 +20,6 @@ from data_synthetic import Bead, GaussianBall
 from recon.run.exact_images import MARGIN, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume
 from torchdic.errors import TurnedRaysError
-from torchdic.fidelity import Propagation
 
 WAVELENGTH = 0.546
 NA = 0.9
@@ -36,7 +35,7 @@ class Case:
     specimen: Bead | GaussianBall
     grid: Grid
     focus: tuple[float, ...]
-    trials: tuple[tuple[Propagation, int], ...]
+    trials: tuple[tuple[str, int], ...]
 
     def volume(self) -> Volume:
         """The specimen on its voxels, float32."""
@@ -98,7 +97,7 @@ def exact(case: Case, na: float) -> Float[Tensor, "prism focus y x"]:
     return exact_images(case.specimen, case.grid, microscope(na), case.acquisition, Fidelity())
 
 
-def errors(case: Case, na: float, propagation: Propagation, steps: int, expected: Tensor) -> tuple[list[float], float]:
+def errors(case: Case, na: float, propagation: str, steps: int, expected: Tensor) -> tuple[list[float], float]:
     """Errors of a propagation in so many equal steps through the whole depth, and its seconds."""
     fidelity = Fidelity(propagation, steps=steps, padding=case.padding)
     return trial(case.volume(), microscope(na), case.acquisition, fidelity, expected)

@@ -16,7 +16,6 @@ import torch
 from comparison import header, row, trial
 from stored import PADDING, Scene, load, microscope, sharp_bead, smooth_ball
 from torchdic import Acquisition, Fidelity, Grid, Prism, image_field
-from torchdic.fidelity import Propagation
 
 
 def main() -> None:
@@ -60,7 +59,7 @@ def thin_object() -> None:
                 print(row((names[specimen], names[kind], defocus), errors, seconds, digits=".1e"), flush=True)
 
 
-def solid(scene: Scene, trials: Sequence[tuple[Propagation, int]]) -> None:
+def solid(scene: Scene, trials: Sequence[tuple[str, int]]) -> None:
     """A row for each (propagation, slices)."""
     print(header(("propagation", "slice"), scene.acquisition.focus))
     for propagation, slices in trials:

@@ -22,9 +22,8 @@ from scipy.ndimage import gaussian_filter
 from rays import peak
 from thin_stack import timed
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
-from torchdic.fidelity import Propagation
 
-PROPAGATIONS: tuple[Propagation, ...] = ("projection", "rays", "wave")
+PROPAGATIONS: tuple[str, ...] = ("projection", "rays", "wave")
 SOURCES = 13
 FOCUS = tuple(float(z) for z in np.linspace(-2, 2, 9))
 PRISMS = tuple(Prism(s, b) for s in ((0.0, 0.24), (0.24, 0.0)) for b in (math.pi / 2, -math.pi / 2))
@@ -57,7 +56,7 @@ def main() -> None:
         )
 
 
-def measure(propagation: Propagation, shape: tuple[int, ...], repeats: int) -> dict:
+def measure(propagation: str, shape: tuple[int, ...], repeats: int) -> dict:
     """Seconds, peak MiB and transforms of one propagation, in this process."""
     noise = gaussian_filter(np.random.default_rng(0).standard_normal(shape), 4)
     delta = torch.nn.Parameter(torch.from_numpy((0.01 * noise / noise.std()).astype(np.float32)))

@@ -59,7 +59,6 @@ from torchdic import (
     plan,
 )
 from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
-from torchdic.fidelity import Propagation
 from torchdic.files.stack import write_stack
 from torchdic.files.whole import write_json, write_text
 from torchdic.forward.foresee import allotted
@@ -206,7 +205,7 @@ def _work_precision(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: simulation.exact: the exact field of this specimen isn't known")
     volume = _volume(specimen, grid, options.device)
     candidates = config.candidates or ladder(grid, padded=not reaches_a_side(volume))
-    reference: dict[Propagation, Fidelity] = converged_fidelities(candidates, grid)
+    reference: dict[str, Fidelity] = converged_fidelities(candidates, grid)
     if (given := config.work_precision.reference) is not None:
         reference = {propagation: replace(given, propagation=propagation) for propagation in reference}
     prepare_folder(options.out)

@@ -24,6 +24,8 @@ from torchdic import (
     image,
     image_field,
 )
+from torchdic.forward import foresee
+from torchdic.memory import free as machine
 from torchdic.planning.work_precision import peak_bytes
 
 GRID = Grid((7, 26, 30), (0.3, 0.2, 0.21))
@@ -120,7 +122,7 @@ def test_without_a_gradient_batches_stay_in_the_caches_and_images_are_the_same(s
     volume, fidelity = specimen(torch.float64), Fidelity("wave")
     whole = foreseen(volume, SCOPE, ACQUISITION, fidelity)
     images = image(volume, SCOPE, ACQUISITION, fidelity)
-    monkeypatch.setattr(memory, "CACHED", whole.peak // 2)
+    monkeypatch.setattr(foresee, "CACHED", whole.peak // 2)
     found = foreseen(volume, SCOPE, ACQUISITION, fidelity)
     assert 1 <= found.sources < whole.sources == 5
     assert found.peak <= whole.peak // 2
@@ -216,7 +218,7 @@ def test_a_learned_lens_or_medium_is_kept_too(specimen):
 @pytest.fixture
 def free(monkeypatch):
     """A function that sets the bytes that are free."""
-    return lambda number: monkeypatch.setattr(memory, "free_bytes", lambda _device: number)
+    return lambda number: monkeypatch.setattr(foresee, "free_bytes", lambda _device: number)
 
 
 @pytest.mark.parametrize("propagation", ["projection", "rays", "wave"])
@@ -254,16 +256,16 @@ def test_fields_are_refused_too(free):
 
 
 def test_free_bytes_are_those_of_the_machine():
-    known = memory.free_bytes(torch.device("cpu"))
+    known = machine.free_bytes(torch.device("cpu"))
     assert known is None or known > 1 << 20
-    assert memory.free_bytes(torch.device("meta")) is None
+    assert machine.free_bytes(torch.device("meta")) is None
 
 
 def test_available_memory_is_linuxs_estimate(tmp_path):
     table = tmp_path / "meminfo"
     table.write_text("MemTotal: 2048 kB\nMemFree: 100 kB\nMemAvailable:    1024 kB\n", encoding="ascii")
-    assert memory.available(table) == 1 << 20
-    assert memory.available(tmp_path / "missing") is None
+    assert machine.available(table) == 1 << 20
+    assert machine.available(tmp_path / "missing") is None
 
 
 @pytest.mark.parametrize(
@@ -284,12 +286,12 @@ def test_control_groups_leave_what_the_tightest_of_them_leaves(tmp_path, line, f
         (base / part / most).write_text(f"{limit}\n", encoding="ascii")
         (base / part / now).write_text(f"{used}\n", encoding="ascii")
         (base / part / "memory.stat").write_text(f"anon 5\n{cached} 500\n", encoding="ascii")
-    assert sorted(memory.left_by_groups(tmp_path, membership)) == [1500, 4500]
-    assert memory.left_by_groups(tmp_path, tmp_path / "missing") == []
+    assert sorted(machine.left_by_groups(tmp_path, membership)) == [1500, 4500]
+    assert machine.left_by_groups(tmp_path, tmp_path / "missing") == []
 
 
 def test_gib_is_what_a_message_counts_in():
     with pytest.raises(ShortOfMemoryError, match=r"This want at least 3 GiB of memory, 1.5 GiB are free"):
-        memory.check_room(3 << 30, 3 << 29, "This")
-    memory.check_room(3 << 30, None, "This")
-    assert math.isclose(memory.GIB, 2**30)
+        machine.check_room(3 << 30, 3 << 29, "This")
+    machine.check_room(3 << 30, None, "This")
+    assert math.isclose(machine.GIB, 2**30)

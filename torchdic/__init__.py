@@ -9,9 +9,10 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
+import torchdic.propagation.table  # first: a fidelity names one of the propagations in the table
 from torchdic.errors import SamplingWarning, ShortOfMemoryError, ToleranceWarning
-from torchdic.fidelity import DRAFT, REFERENCE, STANDARD, Fidelity
-from torchdic.forward.foresee import Foreseen, foreseen
+from torchdic.fidelity import Fidelity
+from torchdic.forward.foresee import foreseen
 from torchdic.forward.images import image, image_field
 from torchdic.grid import Grid
 from torchdic.instrument.camera import Camera
@@ -22,9 +23,11 @@ from torchdic.instrument.polarisation import Polarisation
 from torchdic.instrument.polarised_lenses import JonesPupil
 from torchdic.instrument.prism import Prism
 from torchdic.instrument.thin_lens import ThinLens, thin_lens
+from torchdic.memory.budget import Foreseen
 from torchdic.planning.effects import Effect
 from torchdic.planning.plan import Plan, plan
 from torchdic.planning.work_precision import Candidate, Trial, work_precision
+from torchdic.propagation.presets import DRAFT, REFERENCE, STANDARD
 from torchdic.rays.trace import Rays, launch, trace
 from torchdic.specimen.volume import Volume
 

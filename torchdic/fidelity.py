@@ -2,15 +2,26 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args
 
 from torchdic.specimen.interpolation import Interpolation
 
-Propagation = Literal["projection", "rays", "wave"]
 Solver = Literal["euler", "midpoint", "rk4", "bosh3", "dopri5", "dopri8"]
 Defocus = Literal["exact", "paraxial"]
 AberrationMethod = Literal["linear", "cone"]
 ADAPTIVE: frozenset[Solver] = frozenset({"bosh3", "dopri5", "dopri8"})
+
+
+class Checked(Protocol):
+    """What a fidelity asks of a propagation, see `torchdic.propagation.base.Propagation`."""
+
+    def check(self, fidelity: "Fidelity") -> None:
+        """Raise ValueError where the fidelity asks for what the propagation can't have."""
+        ...
+
+
+# Every propagation by its name. `torchdic.propagation.base.register` adds one; a fidelity names one of them.
+PROPAGATIONS: dict[str, Checked] = {}
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,7 @@ class Fidelity:
     Raises ValueError where a value breaks its law.
     """
 
-    propagation: Propagation = "wave"
+    propagation: str = "wave"
     steps: int | None = None
     sources: int = 40
     interpolation: Interpolation = "linear"
@@ -65,8 +76,9 @@ class Fidelity:
     memory: int = 1 << 30
 
     def __post_init__(self) -> None:
+        if self.propagation not in PROPAGATIONS:
+            raise ValueError(f"propagation {self.propagation!r} must be one of {', '.join(map(repr, PROPAGATIONS))}")
         for name, kind in (
-            ("propagation", Propagation),
             ("interpolation", Interpolation),
             ("solver", Solver),
             ("order", Literal[1, 2]),
@@ -78,14 +90,6 @@ class Fidelity:
         method = self.object_aberration
         if method is not None and method not in get_args(AberrationMethod):
             raise ValueError(f"object_aberration {method!r} must be one of 'linear', 'cone'")
-        if method is not None and self.propagation == "wave":
-            raise ValueError(
-                f'object_aberration {method!r} has no use in propagation "wave", whose field has it already'
-            )
-        if method is not None and self.propagation == "rays" and self.amplitude:
-            raise ValueError(
-                f"object_aberration {method!r} double-counts what the rays' amplitude does: amplitude must be false"
-            )
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps} must be at least 1")
         if self.sources < 1:
@@ -98,13 +102,4 @@ class Fidelity:
             raise ValueError(f"reference_plane {self.reference_plane} must be a finite depth in µm")
         if not self.memory > 0:
             raise ValueError(f"memory {self.memory} must be above 0 bytes")
-
-
-# Errors of images (torchdic.image_error) on the scenes of `python benchmarks/accuracy.py`: a thin weak bead, a cell, a
-# thick graded ball and a sharp strong bead, as tests/test_precision.py holds them.
-DRAFT = Fidelity("wave", sources=12, order=1)
-"""A quick look, at up to twice the price of a projection: 0.037, 0.20, 0.039 and 0.31 off."""
-STANDARD = Fidelity("wave")
-"""The default: 0.019, 0.084, 0.036 and 0.071 off; 8 voxels of padding bring the cell to 0.036, the ball to 0.0038."""
-REFERENCE = Fidelity("wave", sources=128, interpolation="cubic", padding=16)
-"""What the others are compared with: 0.017, 0.012, 0.0035 and 0.040 off; the beads' is their voxels' own error."""
+        PROPAGATIONS[self.propagation].check(self)

@@ -23,13 +23,14 @@ import torch.nn.functional as F
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from torchdic.fidelity import STANDARD, Fidelity
+from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures
 from torchdic.instrument.prism import Prism
 from torchdic.memory.batches import sum_over_sources
 from torchdic.plane_waves import axial_difference, exp_i, to_field, to_spectrum
-from torchdic.propagation.wave import LOWEST_PZ
+from torchdic.propagation.presets import STANDARD
+from torchdic.propagation.split_step import LOWEST_PZ
 from torchdic.scalar import number, scalar
 from torchdic.specimen.volume import Volume
 

@@ -17,7 +17,6 @@ from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
 from torchdic import Fidelity, Trial
-from torchdic.fidelity import Propagation
 from torchdic.files.whole import written_whole
 from torchdic.planning.work_precision import pareto_front
 
@@ -55,7 +54,7 @@ def write_csv(path: Path, trials: Sequence[Trial]) -> None:
             writer.writerow({"name": trial.name, **how, "dtype": trial.candidate.dtype, **found})
 
 
-def as_dict(trials: Sequence[Trial], reference: Mapping[Propagation, Fidelity]) -> dict[str, Any]:
+def as_dict(trials: Sequence[Trial], reference: Mapping[str, Fidelity]) -> dict[str, Any]:
     """What JSON can hold: the trials with all options, each propagation's reference, and where they ran."""
     return {
         "torch": torch.__version__,

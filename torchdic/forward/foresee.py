@@ -1,52 +1,48 @@
-"""Memory foreseen: what the computation of an image will hold at once, and whether there is room for it.
+"""Memory foreseen: what an image will hold at once, measured on a sample of the scene before it is computed.
 
-Each stage says what it holds in values per source and pixel (`torchdic.recompute.Demand`); here they become bytes. Of
-several sources a batch holds, where a gradient is wanted,
-
-    B·pixels·(kept by propagation and imaging + at most beside it),
-
-and the next batch nothing of it if it is computed again in the backward pass. Beside the batches there are the padded
-volume, a spline's coefficients, the images, and what of the volume's gradient is there when a batch begins.
+The sample is the scene itself, with all of its slices, prisms and focus planes, but on few pixels and lit by one source
+or two. It is run, with its gradient where one is wanted, while the bytes that it holds are counted
+(`torchdic.memory.held`). Its pixels and sources are then scaled to the scene's: bytes grow in proportion to the pixels,
+and linearly with the sources of a batch. What a sample holds hangs on the scene's shapes and not on its values, so each
+kind of scene is measured once.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from torchdic.fidelity import STANDARD, Fidelity
-from torchdic.forward.demand import demand_of_imaging
+from torchdic.fidelity import Fidelity
+from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.grid import Grid
+from torchdic.imaging import passband
 from torchdic.instrument.microscope import Acquisition, Microscope
-from torchdic.memory.batches import Demand
-from torchdic.memory.batches import slabs as slab_ranges
+from torchdic.memory.budget import Batches, Foreseen, fitted, least_of
 from torchdic.memory.free import check_room, free_bytes
-from torchdic.object_aberration.levels import Levels, demand_of_map, kept_by_levels, object_levels
-from torchdic.propagation.bent_rays import demand_of_rays, reference_plane
-from torchdic.propagation.projection import demand_of_projection
-from torchdic.propagation.wave import demand_of_wave
+from torchdic.memory.held import Course, course_of, extrapolated, most
+from torchdic.memory.signature import signature, stand_in
+from torchdic.propagation.base import propagation_of
+from torchdic.propagation.presets import STANDARD
 from torchdic.specimen.volume import Volume
 
+# Pixels along a side of the sample: about so many, and as many as the scene has where those are fewer.
+SIDES = range(36, 53)
 # Bytes that a batch on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches, up to 1.4
 # times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
-
-
-@dataclass(frozen=True)
-class Foreseen:
-    """What an image holds at once, in bytes of tensors beyond the volume, and how that was brought about.
-
-    peak: at most, the backward pass included where a gradient is wanted. least: as little as it can be brought to, by
-    single sources whose steps are computed again; peak where the budget is smaller. sources: in a batch. slabs: whether
-    each batch's steps are computed again, slab by slab, in the backward pass.
-    """
-
-    peak: int
-    least: int
-    sources: int
-    slabs: bool = False
+# More bytes than any scene holds for each source and pixel, and for each slice and image where a gradient is wanted. A
+# scene that fits into its budget even so is computed at once and not measured.
+AMPLE = 2048
+# The same for the map of an object aberration, which serves all sources: as many times AMPLE for each slice.
+MAP = 40
+# Kinds of scenes whose measurements are kept.
+KEPT = 32
+_measured: "OrderedDict[Hashable, _Sample]" = OrderedDict()
 
 
 def foreseen(
@@ -59,260 +55,312 @@ def foreseen(
 ) -> Foreseen:
     """What `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
 
-    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad. A
-    fidelity's object_aberration, on whose strength the memory depends, is found for it. Of an adaptive solver the steps
-    are unknown: one a slice is assumed.
+    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad. An
+    object_aberration of the fidelity is found, because the memory depends on how strong it is.
     """
     levels = 0
     if fidelity.object_aberration is not None:
         with torch.no_grad():
-            plane = reference_plane(volume, fidelity)
-            found = [levels_of(volume, plane, part, fidelity) for part, _ in microscope.colours()]
-            levels = max(len(part.defocus) for part in found)
-    return _foreseen(volume, microscope, acquisition, fidelity, levels, gradient)
+            levels = Passage.through(volume, microscope, acquisition, fidelity).most_levels
+    with torch.set_grad_enabled(torch.is_grad_enabled() if gradient is None else gradient):
+        sample = _sample_of(volume, microscope, acquisition, fidelity, levels, learned=bool(gradient))
+        return sample.foreseen(fidelity.memory)
 
 
-def allotted(
-    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 0
-) -> Foreseen:
-    """How `image` computes within its budget and what is free; levels: of an object_aberration.
+def allot(
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int | None = None
+) -> Batches:
+    """The batches in which `image` computes within its budget and what is free.
 
-    Raises ShortOfMemoryError where even single sources, their steps computed again, want more than is free.
+    levels: of an object aberration; None where it isn't known yet. Raises ShortOfMemoryError where even single sources,
+    their steps computed again, want more than is free.
     """
-    free = free_bytes(volume.delta.device)
-    fidelity = _within(fidelity, free)
-    found = _foreseen(volume, microscope, acquisition, fidelity, levels)
+    grid, device = volume.grid.widened(fidelity.padding, fidelity.padding), volume.delta.device
+    slices, images = grid.shape[0], len(acquisition.prisms) * len(acquisition.focus)
+    sources, gradient = len(microscope.sources(fidelity.sources)[1]), torch.is_grad_enabled()
+    of_source = slices + images + (levels or 0) if gradient else 1
+    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if gradient else 1)
+    free = free_bytes(device)
+    if _ample(sources * of_source + of_map, grid, fidelity, device, free):
+        return Batches(sources)
     shape = "×".join(map(str, volume.grid.shape))
     what = (
         f"{len(acquisition.prisms)} prism settings × {len(acquisition.focus)} focus planes of {shape} voxels by "
         f'"{fidelity.propagation}"'
     )
-    check_room(found.least, free, what)
-    return found
+    sample = _sample_of(volume, microscope, acquisition, fidelity, levels or 0)
+    sample.check_room(free, what)
+    return sample.fitted(fidelity.memory, free)
 
 
-def allotted_to_fields(
-    transmission: Tensor,
-    grid: Grid,
-    background: Tensor,
-    sources: int,
-    microscope: Microscope,
-    acquisition: Acquisition,
-    fidelity: Fidelity,
-) -> Foreseen:
-    """`allotted` for `image_field`: fields (y, x) or (source, y, x) that are there already; grid: with the padding."""
-    free = free_bytes(transmission.device)
-    wanted = torch.is_grad_enabled()
-    own = wanted and transmission.requires_grad
-    setting = wanted and learned((background, microscope, acquisition))
-    # padded, and its spectrum; a gradient of each
-    aside = (2 + 2 * own) * 2 * (sources if transmission.ndim == 3 else 1)
-    imaging = demand_of_imaging(grid, microscope, acquisition, learned=setting)
-    images = len(acquisition.prisms) * len(acquisition.focus)
-    scene = _Scene(
-        crossing=Demand(0, 0, 0), imaging=imaging, sources=sources, aside=aside, images=images, learned=own or setting
-    )
-    _, ny, nx = grid.shape
-    each = ny * nx * transmission.real.element_size()
-    found = _fitted(scene, each, _within(fidelity, free).memory, transmission.device)
-    check_room(found.least, free, f"{len(acquisition.prisms)} × {len(acquisition.focus)} images of {ny}×{nx} pixels")
-    return found
+def allot_fields(passage: FieldPassage) -> Batches:
+    """As `allot`, for the images of fields that are there already."""
+    fidelity, acquisition, device = passage.fidelity, passage.acquisition, passage.transmission.device
+    grid = passage.grid.widened(fidelity.padding, fidelity.padding)
+    prisms, planes = len(acquisition.prisms), len(acquisition.focus)
+    sources, free = len(passage.microscope.sources(fidelity.sources)[1]), free_bytes(device)
+    kept = sources * (prisms * planes if torch.is_grad_enabled() else 1)
+    if _ample(kept, grid, fidelity, device, free):
+        return Batches(sources)
+    _, ny, nx = passage.grid.shape
+    sample = _sample_of_fields(passage)
+    sample.check_room(free, f"{prisms} × {planes} images of {ny}×{nx} pixels")
+    return sample.fitted(fidelity.memory, free)
 
 
-def levels_of(volume: Volume, plane: float, microscope: Microscope, fidelity: Fidelity) -> Levels:
-    """The levels of a fidelity's object_aberration in light of one wavelength."""
-    momentum, _ = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
-    parts = microscope.wavelength, microscope.objective, microscope.condenser
-    return object_levels(volume, plane, *parts, momentum, fidelity)
+def _ample(kept: int, grid: Grid, fidelity: Fidelity, device: torch.device, free: int | None) -> bool:
+    """Whether all sources fit into the budget at once, whatever is done with them; kept: see AMPLE."""
+    return AMPLE * kept * math.prod(grid.shape[1:]) <= _budget(fidelity.memory, free, device)
 
 
-def learned(part: object) -> bool:
-    """Whether a tensor anywhere in a dataclass, sequence or mapping requires grad."""
-    if isinstance(part, Tensor):
-        return part.requires_grad
-    if isinstance(part, Mapping):
-        return any(learned(value) for value in part.values())
-    if isinstance(part, list | tuple):
-        return any(learned(value) for value in part)
-    if is_dataclass(part):
-        return any(learned(getattr(part, field.name)) for field in fields(part))
-    return False
+def _budget(memory: int, free: int | None, device: torch.device) -> int:
+    """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""
+    budget = memory if free is None else max(1, min(memory, free))
+    return min(budget, CACHED) if device.type == "cpu" and not torch.is_grad_enabled() else budget
 
 
-# --- the estimate ----------------------------------------------------------------------------------------------------
+# --- the sample ------------------------------------------------------------------------------------------------------
+
+# Runs a sample of so many sources in batches, and its gradient if one is wanted.
+Run = Callable[[int, Batches], None]
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What the estimate reads. Values are per pixel, those of a Demand per source too.
+class _Sample:
+    """A scene's sample, and what it was found to hold.
 
-    aside: beside the batches. before: at most, before or after them. slices: of each field whose gradient is wanted.
-    images: prisms × focus planes. learned: whether a gradient is wanted at all, crosses: whether one goes through the
-    specimen. bent: whether rays do.
+    run: computes the sample. sources: of the scene. scale: pixels of the scene to one of the sample. apart: whether
+    every source has a field of its own, which is held beside the batches.
     """
 
-    crossing: Demand
-    imaging: Demand
-    sources: int
-    images: int
-    learned: bool
-    crosses: bool = False
-    bent: bool = False
-    components: int = 1
-    colours: int = 1
-    slices: int = 0
-    aside: float = 0
-    before: float = 0
+    def __init__(
+        self,
+        run: Run,
+        sources: int,
+        scale: float,
+        device: torch.device,
+        *,
+        small_batches: bool = False,
+        apart: bool = False,
+    ) -> None:
+        self._run, self._sources, self._scale, self._device = run, sources, scale, device
+        self._small_batches, self._apart = small_batches, apart
+        self._gradient = torch.is_grad_enabled()
+        self._courses: dict[tuple[int, Batches], Course] = {}
 
-    def values(self, batch: int, *, slabs: bool) -> float:
-        """Values per pixel held at most, in batches of so many sources."""
-        crossing, imaging, several = self.crossing, self.imaging, batch < self.sources
-        spectrum, images = 2 * self.components, (1 + several) * self.images
-        if not self.learned:
-            crossed = images - self.images + max(batch * crossing.alone, crossing.once)
-            imaged = images + imaging.shared + batch * (spectrum + imaging.alone)
-            return self.aside + max(crossed, imaged, images + self.images, imaging.once, self.before)
-        images += self.images
-        imaged = max(imaging.alone, imaging.kept + imaging.working)
-        if not self.crosses:
-            crossed = images + max(batch * crossing.alone, crossing.once)
-            others = 0 if several else (self.colours - 1) * batch * (spectrum + imaging.kept)
-            imaged = images + imaging.shared + batch * (spectrum + imaged) + others
-            return self.aside + max(crossed, imaged, imaging.once, self.before)
-        steps, longest, carried = crossing.steps, crossing.steps, 0.0
-        if slabs:
-            ranges = list(slab_ranges(steps, split=True))
-            longest, carried = max(last - first for first, last in ranges), len(ranges) * crossing.carried
-        shared = longest * crossing.shared
-        held = batch * (carried if slabs else steps * crossing.step) + (0 if slabs else shared)
-        others = (self.colours - 1) * (held + batch * (crossing.kept + imaging.kept))
-        found = max(
-            images + imaging.shared + held + batch * (crossing.kept + max(crossing.working, imaged)),
-            images + held + crossing.once,
-            # the last slab in the backward pass, beside the gradients of what lies behind it
-            batch * (carried + longest * crossing.step + crossing.back)
-            + shared
-            + slabs * (1 - longest / steps) * self.slices,
-        )
-        if several:
-            return self.aside + max(found + self.slices, 3 * self.slices, imaging.once, self.before)
-        return self.aside + max(found + others, 2 * self.slices, imaging.once, self.before)
+    def foreseen(self, memory: int) -> Foreseen:
+        """What the scene holds within a budget in bytes."""
+        batches = self._fitted(_budget(memory, None, self._device))
+        return Foreseen(self.peak(batches), self._least, batches.sources, batches.slabs)
 
+    def check_room(self, free: int | None, what: str) -> None:
+        """Raise ShortOfMemoryError where the scene can't be computed in what is free."""
+        if free is not None and self.peak(Batches(self._sources)) > free:
+            check_room(self._least, free, what)
 
-def _scene(
-    volume: Volume,
-    microscope: Microscope,
-    acquisition: Acquisition,
-    fidelity: Fidelity,
-    momentum: Tensor,
-    levels: int,
-    gradient: bool | None,
-) -> _Scene:
-    parts = (volume.delta, volume.absorption, volume.background, momentum)
-    fields = 1 + (volume.absorption is not None)
-    own = sum(part is not None and part.requires_grad for part in parts[:2])
-    setting = learned((microscope, acquisition))
-    if gradient is None:
-        wanted = torch.is_grad_enabled()
-        crosses = wanted and any(part is not None and part.requires_grad for part in parts)
-    else:
-        wanted, crosses, own = gradient, gradient, max(own, int(gradient))
-    turned = microscope.turns and fidelity.propagation == "rays"
-    components = 2 if turned else 1
-    if fidelity.propagation == "projection":
-        crossing = demand_of_projection(volume, fidelity)
-    elif fidelity.propagation == "rays":
-        crossing = demand_of_rays(volume, fidelity, turned=turned)
-    else:
-        crossing = demand_of_wave(volume, momentum, fidelity)
-    slices = volume.grid.shape[0]
-    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
-    pixels = math.prod(grid.shape[1:])
-    # the mean depth is found in float64, a spline along one axis after the other
-    before = 0.0
-    if fidelity.propagation != "wave" and fidelity.reference_plane is None:
-        wide = 0 if volume.delta.dtype == torch.float64 else torch.float64.itemsize / volume.delta.element_size()
-        before = slices * (1 + wide) * math.prod(volume.grid.shape[1:]) / pixels
-    if fidelity.interpolation == "cubic" and fidelity.propagation != "wave":
-        before = max(before, 3 * slices)
-    aside = (
-        fields
-        * slices
-        * ((fidelity.padding > 0) + (fidelity.interpolation == "cubic" and fidelity.propagation != "wave"))
-    )
-    if levels:
-        crossing = replace(
-            crossing,
-            alone=max(crossing.alone, 10 * components),
-            kept=crossing.kept + components * kept_by_levels(levels),
-            working=max(crossing.working, 8 * components),
-        )
-        aside += levels * (5 if crosses else 1)
-        lens = demand_of_map(volume, reference_plane(volume, fidelity), fidelity)
-        if not crosses:
-            before = max(before, lens.alone)
-        elif lens.whole * pixels * volume.delta.element_size() <= fidelity.memory:
-            aside += lens.whole
+    def fitted(self, memory: int, free: int | None) -> Batches:
+        """The batches that fit into a budget and what is free."""
+        return self._fitted(_budget(memory, free, self._device))
+
+    def _fitted(self, budget: int) -> Batches:
+        ways = {"gradient": self._gradient, "small_batches": self._small_batches}
+        return fitted(self.peak, self._sources, budget, **ways)
+
+    @property
+    def _least(self) -> int:
+        return least_of(self.peak, self._sources, gradient=self._gradient, small_batches=self._small_batches)
+
+    def peak(self, batches: Batches) -> int:
+        """The most bytes that the scene holds at once."""
+        count, several = batches.sources, batches.sources < self._sources
+        one = self._course(1 + several, Batches(1, batches.slabs))
+        if count == 1:
+            held = most(one)
         else:
-            ranges = list(slab_ranges(lens.steps, split=True))
-            aside += lens.carried * len(ranges)
-            before = lens.kept + lens.step * max(last - first for first, last in ranges)
-    imaging = demand_of_imaging(grid, microscope, acquisition, components, learned=wanted and setting)
-    images, colours = len(acquisition.prisms) * len(acquisition.focus), len(microscope.colours())
-    aside += (colours - 1) * images * math.prod(volume.grid.shape[1:]) / pixels
-    return _Scene(
-        crossing=crossing,
-        imaging=imaging,
-        sources=len(momentum),
-        images=images,
-        learned=crosses or (wanted and setting),
-        crosses=crosses,
-        bent=fidelity.propagation == "rays",
-        components=components,
-        colours=colours,
-        slices=own * slices,
-        aside=aside,
-        before=before,
-    )
+            held = extrapolated(one, self._course(2 * (1 + several), Batches(2, batches.slabs)), count)
+        if self._apart and several:
+            further = most(self._course(3, Batches(1))) - most(self._course(2, Batches(1)))
+            held += further * (self._sources - 2 * count)
+        return math.ceil(self._scale * held)
+
+    def _course(self, sources: int, batches: Batches) -> Course:
+        if (sources, batches) not in self._courses:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the scene itself will warn
+                with torch.set_grad_enabled(self._gradient):
+                    self._courses[sources, batches] = course_of(lambda: self._run(sources, batches))
+        return self._courses[sources, batches]
 
 
-def _foreseen(
+def _remembered(key: Hashable, make: Callable[[], _Sample]) -> _Sample:
+    """The sample of a kind of scene, made where there is none yet."""
+    if key not in _measured:
+        _measured[key] = make()
+        if len(_measured) > KEPT:
+            _measured.popitem(last=False)
+    _measured.move_to_end(key)
+    return _measured[key]
+
+
+def _sample_of(
     volume: Volume,
     microscope: Microscope,
     acquisition: Acquisition,
     fidelity: Fidelity,
-    levels: int = 0,
-    gradient: bool | None = None,
-) -> Foreseen:
-    momentum, _ = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
-    scene = _scene(volume, microscope, acquisition, fidelity, momentum, levels, gradient)
-    _, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
-    return _fitted(scene, ny * nx * volume.delta.element_size(), fidelity.memory, volume.delta.device)
+    levels: int,
+    *,
+    learned: bool = False,
+) -> _Sample:
+    """The sample of a volume's scene; learned: whether Δn is, whatever the volume says."""
+    learned = learned or volume.delta.requires_grad
+    propagation = propagation_of(fidelity)
+    filled = _filled(volume) if propagation.holds_by_content else None
+    # the budget plays a part in the map of an object aberration, which is crowded by itself or not
+    plain = fidelity if fidelity.object_aberration is not None else replace(fidelity, memory=1)
+    parts = volume.grid, volume.delta.dtype, volume.absorption, volume.background, microscope, acquisition
+    key = signature(parts), plain, levels, filled, learned, torch.is_grad_enabled(), volume.delta.device.type
+
+    def make() -> _Sample:
+        sample = _VolumeSample(volume, microscope, acquisition, fidelity, levels, learned=learned)
+        sources, device = len(microscope.sources(fidelity.sources)[1]), volume.delta.device
+        return _Sample(sample.run, sources, sample.scale, device, small_batches=propagation.small_batches)
+
+    return _remembered(key, make)
 
 
-def _within(fidelity: Fidelity, free: int | None) -> Fidelity:
-    """The fidelity with a budget of what is free, where that is less."""
-    return fidelity if free is None else replace(fidelity, memory=max(1, min(fidelity.memory, free)))
+def _sample_of_fields(passage: FieldPassage) -> _Sample:
+    """The sample of fields that are there already."""
+    parts = passage.grid, passage.transmission, passage.background, passage.microscope, passage.acquisition
+    plain, device = replace(passage.fidelity, memory=1), passage.transmission.device
+    key = signature(parts), plain, torch.is_grad_enabled(), device.type
+
+    def make() -> _Sample:
+        sources = len(passage.microscope.sources(passage.fidelity.sources)[1])
+        run, scale = _field_run(passage)
+        return _Sample(run, sources, scale, device, apart=passage.transmission.ndim == 3)
+
+    return _remembered(key, make)
 
 
-def _fitted(scene: _Scene, each: int, budget: int, device: torch.device) -> Foreseen:
-    """As few batches as fit into a budget in bytes; each: bytes of a value per pixel."""
-    if not scene.learned and device.type == "cpu":
-        budget = min(budget, CACHED)
+class _VolumeSample:
+    """A volume's scene on few pixels; scale: pixels of the scene to one of the sample, padding included."""
 
-    def peak(batch: int, *, slabs: bool = False) -> int:
-        return math.ceil(scene.values(batch, slabs=slabs) * each)
+    def __init__(
+        self,
+        volume: Volume,
+        microscope: Microscope,
+        acquisition: Acquisition,
+        fidelity: Fidelity,
+        levels: int,
+        *,
+        learned: bool,
+    ) -> None:
+        pad = fidelity.padding
+        whole = volume.grid.widened(pad, pad)
+        sides, padding = _few_pixels(volume.grid, pad, microscope)
+        self._grid = replace(volume.grid, shape=(volume.grid.shape[0], *sides))
+        self.scale = math.prod(whole.shape[1:]) / math.prod(self._grid.widened(padding, padding).shape[1:])
+        memory = max(1, int(fidelity.memory / self.scale))
+        self._fidelity = replace(fidelity, padding=padding, memory=memory)
+        self._microscope, self._acquisition = stand_in(replace(microscope, camera=None)), stand_in(acquisition)
+        self._levels, self._background = max(levels, 2), stand_in(volume.background)
+        # the content is as far apart as in the volume, relative to the sides, and its slopes are as steep
+        gentle = min(sides[0] / volume.grid.shape[1], sides[1] / volume.grid.shape[2])
+        self._delta = gentle * _pooled(volume.delta, sides)
+        self._absorption = None if volume.absorption is None else _pooled(volume.absorption, sides)
+        self._learned = [
+            learned,
+            volume.absorption is not None and volume.absorption.requires_grad,
+        ]
 
-    # all at once; their steps in slabs (not of rays, faster in small batches); batches of equal size; single sources,
-    # whose steps are in slabs if need be
-    everything = scene.sources
-    ways = [(everything, False)] + ([] if scene.bent else [(everything, True)])
-    ways += [(math.ceil(everything / n), False) for n in range(2, everything + 1)]
-    ways.append((1, True))
-    peaks = {
-        (batch, slabs): peak(batch, slabs=slabs) for batch, slabs in dict.fromkeys(ways) if scene.crosses or not slabs
-    }
-    least = min(peaks.values())
-    return next(
-        Foreseen(held, least, batch, slabs) for (batch, slabs), held in peaks.items() if held <= max(budget, least)
-    )
+    def run(self, sources: int, batches: Batches) -> None:
+        """Compute the sample. Where its content does not let light through, it is computed without any."""
+        try:
+            self._compute(sources, batches, self._delta)
+        except ValueError:
+            self._compute(sources, batches, torch.zeros_like(self._delta))
+
+    def _compute(self, sources: int, batches: Batches, delta: Tensor) -> None:
+        delta = delta.detach().requires_grad_(self._learned[0])
+        absorption = self._absorption
+        if absorption is not None:
+            absorption = absorption.detach().requires_grad_(self._learned[1])
+        volume = Volume(self._grid, delta, self._background, absorption)
+        microscope = _lit_by(self._microscope, sources, self._fidelity)
+        passage = Passage.through(volume, microscope, self._acquisition, self._fidelity, self._levels)
+        images = passage.images(batches)
+        if images.requires_grad:
+            images.sum().backward()
+
+
+def _field_run(passage: FieldPassage) -> tuple[Run, float]:
+    """What computes fields on few pixels, and how many of the scene's pixels one of theirs stands for."""
+    fidelity, pad = passage.fidelity, passage.fidelity.padding
+    (ny, nx), padding = _few_pixels(passage.grid, pad, passage.microscope)
+    whole = passage.grid.widened(pad, pad)
+    grid = Grid((1, ny, nx), passage.grid.spacing)
+    scale = math.prod(whole.shape[1:]) / math.prod(grid.widened(padding, padding).shape[1:])
+    own = passage.transmission
+    few = own.detach()[..., :ny, :nx].cpu()
+    background = stand_in(passage.background)
+    microscope, acquisition = stand_in(replace(passage.microscope, camera=None)), stand_in(passage.acquisition)
+
+    def run(sources: int, batches: Batches) -> None:
+        field = few if few.ndim == 2 else few[torch.arange(sources) % len(few)]
+        field = field.clone().requires_grad_(own.requires_grad)
+        lit = _lit_by(microscope, sources, fidelity)
+        sample = FieldPassage(field, grid, background, lit, acquisition, replace(fidelity, padding=padding))
+        images = sample.images(batches)
+        if images.requires_grad:
+            images.sum().backward()
+
+    return run, scale
+
+
+def _lit_by(microscope: Microscope, sources: int, fidelity: Fidelity) -> Microscope:
+    """A microscope with so many of its sources, one after the other and again from the first."""
+    points, _ = microscope.sources(fidelity.sources, dtype=torch.float64)
+    return microscope.lit_from(points[torch.arange(sources) % len(points)])
+
+
+def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple[int, int], int]:
+    """The sample's sides (y, x) without padding, and its padding.
+
+    Of the sizes that serve, the one in which a pupil's window and the coarser array for the intensities take about the
+    same parts of the pixels as in the scene.
+    """
+    whole = grid.widened(padding, padding)
+    wavelength = min(part.wavelength for part, _ in microscope.colours())
+    aimed = _parts(whole, wavelength, microscope)
+    best = None
+    for side in SIDES:
+        share = min(1.0, side / min(whole.shape[1:]))
+        pad = math.ceil(padding * share)
+        sides = tuple(min(n, max(1, math.ceil(share * (n + 2 * padding)) - 2 * pad)) for n in grid.shape[1:])
+        sides = (min(sides[0], side), min(sides[1], side))
+        few = replace(grid, shape=(grid.shape[0], *sides)).widened(pad, pad)
+        differs = sum(abs(a - b) for a, b in zip(_parts(few, wavelength, microscope), aimed, strict=True))
+        if best is None or differs < best[0]:
+            best = differs, sides, pad
+    assert best is not None
+    return best[1], best[2]
+
+
+def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float, float]:
+    """The parts of the array's pixels that a pupil's window and the array for the intensities have."""
+    objective = microscope.objective
+    found = None if objective is None else passband.sizes(grid, wavelength, objective.na)
+    if found is None:
+        return 1.0, 1.0
+    window, array = (math.prod(shape) / math.prod(grid.shape[1:]) for shape in found)
+    return window, array
+
+
+def _pooled(field: Tensor, sides: tuple[int, int]) -> Tensor:
+    """A field's means over blocks of pixels, on the CPU; the field itself where it has no more pixels."""
+    return F.adaptive_avg_pool2d(field.detach().cpu()[None], sides)[0]
+
+
+def _filled(volume: Volume) -> int:
+    """Eighths of the array's pixels in which there is something."""
+    there = (volume.delta.detach() != 0).any(0)
+    return round(8 * float(there.sum()) / there.numel())

@@ -95,5 +95,6 @@ def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int,
         half = (rows - 1) // 2
         nothing = spectrum.new_zeros(*spectrum.shape[:-2], ny - 2 * half - 1, spectrum.shape[-1])
         spectrum = torch.cat((spectrum[..., : half + 1, :], nothing, spectrum[..., rows - half :, :]), -2)
-    # what is dark may come out below 0 by rounding
-    return torch.fft.irfft2(spectrum, s=(ny, nx), norm="forward").clamp_min(0)
+    # axis by axis, which takes less memory than both at once; what is dark may come out below 0 by rounding
+    spectrum = torch.fft.ifft(spectrum, dim=-2, norm="forward")
+    return torch.fft.irfft(spectrum, n=nx, norm="forward").clamp_min(0)

@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -15,38 +14,6 @@ from torch.utils.checkpoint import checkpoint
 from torchdic.errors import BatchWarning
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Demand:
-    """Values per source and pixel that a stage of the computation holds; 1 is a real number of the volume's dtype.
-
-    alone: at most, where no gradient is wanted. kept: for the backward pass, and each of `steps` steps keeps `step`
-    more. working: at most beside all that is kept. back: at most beside the steps' part alone, while the backward pass
-    takes them back. carried: from slab to slab of steps that are computed again. shared: kept (by each step, if any),
-    however many sources there are. once: at most beside the steps' part, or alone, by one source after
-    the other.
-    """
-
-    alone: float
-    kept: float
-    working: float
-    steps: int = 0
-    step: float = 0
-    back: float = 0
-    carried: float = 0
-    shared: float = 0
-    once: float = 0
-
-    @property
-    def whole(self) -> float:
-        """All that is kept."""
-        return self.kept + self.steps * self.step
-
-
-def indices(dtype: torch.dtype) -> float:
-    """How many values of a dtype an index takes."""
-    return torch.int64.itemsize / dtype.itemsize
 
 
 def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
@@ -93,6 +60,8 @@ class _Replayed(torch.autograd.Function):
 
 def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
     """Steps 0 … steps as consecutive (first, last) ranges: about √steps of them where `split`, or a single one."""
+    if steps == 0:
+        return
     count = math.isqrt(steps - 1) + 1 if split else 1
     edges = [i * steps // count for i in range(count + 1)]
     yield from pairwise(edges)

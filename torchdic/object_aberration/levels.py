@@ -22,10 +22,8 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
-from torchdic.instrument.condenser import Condenser
-from torchdic.instrument.objective import Objective
-from torchdic.memory.batches import Demand
-from torchdic.object_aberration.wavefront import AZIMUTHS, CAREFUL, KEPT_BY_PAIR, KEPT_BY_RAY, RINGS, effective_defocus
+from torchdic.instrument.microscope import Microscope
+from torchdic.object_aberration.wavefront import CAREFUL, effective_defocus
 from torchdic.plane_waves import exp_i, to_spectrum
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
@@ -60,32 +58,10 @@ class Levels:
         return sum(parts, start=torch.zeros_like(field))
 
 
-def kept_by_levels(count: int) -> int:
-    """Values per source and pixel that autograd keeps of so many levels for the backward pass."""
-    return 5 * count + 4
-
-
-def demand_of_map(volume: Volume, plane: float, fidelity: Fidelity) -> Demand:
-    """What the map of a volume's own aberration holds, per pixel: it serves all sources."""
-    share = (volume.grid.extent[0] / 2 - plane) / volume.grid.extent[0]
-    steps = math.ceil((fidelity.steps or volume.grid.shape[0]) * share - 1e-9)
-    if fidelity.object_aberration == "cone":
-        rays = 1 + len(RINGS) * AZIMUTHS
-        return Demand(150 * rays, 30 * rays, 0, steps, KEPT_BY_RAY["cubic"] * rays, carried=10 * rays)
-    return Demand(250, 150, 0, steps, KEPT_BY_PAIR, carried=26)
-
-
-def object_levels(
-    volume: Volume,
-    plane: float,
-    wavelength: float,
-    objective: Objective | None,
-    condenser: Condenser | None,
-    momentum: Float[Tensor, "source 2"],
-    fidelity: Fidelity,
-) -> Levels:
+def object_levels(volume: Volume, plane: float, microscope: Microscope, fidelity: Fidelity, least: int = 2) -> Levels:
     """Levels of the volume's own aberration at depth `plane` (µm), by the method that the fidelity names.
 
+    microscope: of one wavelength. least: levels at least.
     The map's rays are those of `CAREFUL`, a cubic spline crossed by rk4, in the fidelity's steps. A cone's half angle
     is asin(NA_c/n0), a choice of where to look that carries no gradient. Raises ValueError for a cone without a
     condenser's aperture, and as `effective_defocus` and `levels` do.
@@ -93,7 +69,7 @@ def object_levels(
     n0 = number(volume.background)
     half_angle = None
     if fidelity.object_aberration == "cone":
-        na = 0.0 if condenser is None else condenser.na
+        na = 0.0 if microscope.condenser is None else microscope.condenser.na
         if na == 0:
             raise ValueError(
                 'object_aberration "cone" takes its half angle from the condenser, whose NA must be above 0'
@@ -104,24 +80,27 @@ def object_levels(
     defocus = effective_defocus(
         volume, plane, fidelity=careful, method=fidelity.object_aberration, half_angle=half_angle
     )
+    momentum, _ = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
     steepest = float(momentum.detach().norm(dim=-1).max())
+    objective = microscope.objective
     reach = n0 if objective is None else min(n0, max(objective.na, steepest))
     # the paraxial difference is the smaller one
-    return levels(defocus, 2 * math.pi / wavelength * (n0 - math.sqrt(n0**2 - reach**2)))
+    rate = 2 * math.pi / microscope.wavelength * (n0 - math.sqrt(n0**2 - reach**2))
+    return levels(defocus, rate, least=least)
 
 
-def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None = None) -> Levels:
+def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None = None, *, least: int = 2) -> Levels:
     """Levels for a field's δ (y, x) in µm, where the phase changes by at most `rate` rad per µm of it.
 
-    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. The levels themselves carry
-    no gradient: but for rounding the field does not depend on them. Raises ValueError where δ is not finite, or asks
-    for more than MOST_LEVELS.
+    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. least: levels at
+    least. The levels themselves carry no gradient: but for rounding the field does not depend on them. Raises
+    ValueError where δ is not finite, or asks for more than MOST_LEVELS.
     """
     low, high = (float(v) for v in torch.aminmax(defocus.detach()))
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ValueError("object_aberration is without bound: light of some object point leaves the volume collimated")
     half = max((high - low) / 2, LEAST_SPAN / rate)
-    count = _count(rate * half, tolerance or torch.finfo(defocus.dtype).eps)
+    count = max(least, _count(rate * half, tolerance or torch.finfo(defocus.dtype).eps))
     if count > MOST_LEVELS:
         raise ValueError(
             f"object_aberration from {low:.4g} to {high:.4g} µm asks for {count} levels, more than {MOST_LEVELS}: "

@@ -10,19 +10,15 @@ import torch
 from torchdic.fidelity import Fidelity
 from torchdic.forward.images import image
 from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.propagation.base import propagation_of
 from torchdic.specimen.volume import Volume
 
-# Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels.
-SETUP, IMAGE, ABSORBING = 30.0, 4.5, 5.0
+# Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels. What
+# crosses the specimen is for each propagation to say.
+SETUP, IMAGE = 30.0, 4.5
 
 # More, for each pure state of polarised light in an image, or for its two beams at once where they stay a scalar pair.
 POLARISED = 8.0
-
-SLAB = {1: 3.5, 2: 5.0}
-
-SLICE = {"linear": 5.0, "cubic": 90.0}
-
-BENT_SLICE = 260.0
 
 # Work of the part that is timed: some 10 ms, beyond what calls alone take.
 TIMED = 3e7
@@ -30,15 +26,9 @@ TIMED = 3e7
 
 def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition: Acquisition) -> float:
     """What an image costs, in FFT butterflies: sources × (what crosses the specimen + images) × N log2 N."""
-    slices, ny, nx = volume.grid.widened(fidelity.padding, fidelity.padding).shape
-    pixels = ny * nx
-    if fidelity.propagation == "wave":
-        extra = 0.0 if volume.absorption is None else ABSORBING
-        inside = (fidelity.steps or slices) * (SLAB[fidelity.order] + extra)
-    elif fidelity.propagation == "projection":
-        inside = slices * SLICE[fidelity.interpolation] * (1 if volume.absorption is None else 2)
-    else:
-        inside = (fidelity.steps or slices) * BENT_SLICE
+    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
+    pixels = math.prod(grid.shape[1:])
+    inside = propagation_of(fidelity).work(grid, fidelity, absorbs=volume.absorption is not None)
     polarisation, states = microscope.polarisation, 0
     if polarisation is not None and not polarisation.ideal:
         states = polarisation.states if microscope.vectorial else 1

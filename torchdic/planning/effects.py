@@ -10,6 +10,7 @@ from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition
+from torchdic.planning.comparisons import BENT, STRAIGHT, TRUTH
 from torchdic.planning.cost import work
 from torchdic.planning.image_error import relative
 from torchdic.planning.ladders import Choice, Side
@@ -75,7 +76,7 @@ def effects(scene: Scene, climbed: Climbed, fidelity: Fidelity, tolerance: float
         return relative(images, truth)
 
     found = _optics(climbed, tolerance, effect)
-    found[0] = replace(found[0], cost=saved(replace(fidelity, propagation="projection")))
+    found[0] = replace(found[0], cost=saved(replace(fidelity, propagation=STRAIGHT)))
 
     K = fidelity.sources
     if len(counts) == 1 and counts[0].fidelity.sources == K:
@@ -151,7 +152,7 @@ def _fewest_slabs(pilot: Scene) -> tuple[int, Tensor]:
     steps = 1
     while True:
         try:
-            return steps, pilot(Fidelity("wave", steps=steps))
+            return steps, pilot(Fidelity(TRUTH, steps=steps))
         except UnstableError:
             if steps >= MOST_UNSTABLE * pilot.slices:
                 raise
@@ -169,8 +170,8 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
     """What each rung between straight rays and waves adds; bounds where projection is good enough or rays fail."""
     names = "bending", "amplitude", "diffraction", "object aberration"
     note = "all that projection lacks"
-    finest = next(way for way in climbed.ways if way.fidelity.propagation == "wave")
-    projection = next((way for way in climbed.ways if way.fidelity.propagation == "projection"), None)
+    finest = next(way for way in climbed.ways if way.fidelity.propagation == TRUTH)
+    projection = next((way for way in climbed.ways if way.fidelity.propagation == STRAIGHT), None)
     if projection is None:
         return [effect(name, 1.0, "light along straight rays can't go on toward +z", basis="bound") for name in names]
     straight = relative(projection.lacks, climbed.truth)
@@ -182,10 +183,10 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
     small = _changed(replace(climbed.pilot, acquisition=Acquisition(acquisition.prisms[:1], ends)), camera=None)
     small = small.window(RAY_WINDOW).lit(RAY_SOURCES)
     steps = min(small.slices, RAY_STEPS)
-    rays = Fidelity("rays", steps=steps)
+    rays = Fidelity(BENT, steps=steps)
     try:
         wave = small(finest.fidelity)
-        projected = small(Fidelity("projection"))
+        projected = small(Fidelity(STRAIGHT))
         bent = small(replace(rays, amplitude=False))
         carried = small(rays)
     except (TurnedRaysError, SidewaysError, UnstableError) as error:
@@ -196,7 +197,7 @@ def _optics(climbed: Climbed, tolerance: float, effect: Callable[..., Effect]) -
         effect("diffraction", relative(wave - carried, wave), "the wave against rays"),
     ]
     try:
-        own = small(Fidelity("projection", object_aberration="linear", steps=steps))
+        own = small(Fidelity(STRAIGHT, object_aberration="linear", steps=steps))
     except ValueError as error:  # too strong a lens
         return [*found, effect(names[-1], straight, f"{note}; {error}", basis="bound")]
     seen = "in straight rays; the wave has it already"

@@ -16,14 +16,17 @@ from torch import Tensor
 from torchdic.errors import TurnedRaysError, UnstableError
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.planning.cost import SLAB, directions
+from torchdic.planning.comparisons import TRUTH
+from torchdic.planning.cost import directions
 from torchdic.planning.image_error import relative
 from torchdic.planning.pilots import MOST, MOST_UNSTABLE, Scene
+from torchdic.propagation.base import propagations
+from torchdic.propagation.wave import SLAB
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
 # What a pilot predicts must stay below this part of the tolerance: the rest is for what a window and few planes miss.
-MARGIN = 0.6
+PREDICTED = 0.6
 
 # Sources of the condenser's quadrature, K rings of 2K: each is as good as its number can be within a pupil.
 COUNTS = (1, 8, 18, 32, 50, 72, 128, 200, 392)
@@ -82,7 +85,7 @@ def source_ladder(pilot: Scene, coarse: Fidelity, tolerance: float) -> tuple[lis
             fall = min(math.sqrt(fall * change / max(before, 1e-300)), 0.9)
         # errors of two numbers have little in common, so that their squares add up to the change's
         beyond = change * fall / math.hypot(1, fall)
-        if beyond <= MARGIN / 2 * tolerance:
+        if beyond <= PREDICTED / 2 * tolerance:
             break
     seen = zip(counts, images, strict=False)
     return [Choice(replace(coarse, sources=count), i - images[-1], beyond) for count, i in seen], images[-1]
@@ -103,7 +106,7 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
 
     def crossed(steps: int, order: Literal[1, 2] = 2) -> Tensor:
         try:
-            return pilot(Fidelity("wave", steps=steps, order=order))
+            return pilot(Fidelity(TRUTH, steps=steps, order=order))
         except UnstableError:
             if order == 2 and steps >= MOST_UNSTABLE * pilot.slices:
                 raise
@@ -117,14 +120,15 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
         if math.isfinite(last):
             # between first order, at edges, and the split step's second
             ratio = min(max(1.5, before / max(last, 1e-300)), 4.0) if math.isfinite(before) else 1.5
-            if last / (ratio - 1) <= MARGIN / 2 * tolerance or ladder[-1] >= MOST * pilot.slices:
+            if last / (ratio - 1) <= PREDICTED / 2 * tolerance or ladder[-1] >= MOST * pilot.slices:
                 break
         ladder.append(2 * ladder[-1])
     truth = finest + (finest - middle) / (ratio - 1)
 
     ways: list[Choice] = []
-    with contextlib.suppress(TurnedRaysError):  # where straight rays can't go on, waves may
-        ways.append(Choice(Fidelity("projection"), pilot(Fidelity("projection")) - truth))
+    for fidelity in (f for propagation in propagations() for f in propagation.planned()):
+        with contextlib.suppress(TurnedRaysError):  # where straight rays can't go on, waves may
+            ways.append(Choice(fidelity, pilot(fidelity) - truth))
     orders: tuple[Literal[1, 2], ...] = 2, 1
     dearest = math.inf  # beyond this work the second order serves better
     for order in orders:
@@ -135,9 +139,9 @@ def way_ladder(pilot: Scene, tolerance: float) -> tuple[list[Choice], Tensor]:
             lacks = crossed(steps, order) - truth
             if not bool(torch.isfinite(lacks).all()):
                 break
-            ways.append(Choice(Fidelity("wave", steps=steps, order=order), lacks))
+            ways.append(Choice(Fidelity(TRUTH, steps=steps, order=order), lacks))
             error = relative(lacks, truth)
-            if order == 2 and error <= MARGIN / 8 * tolerance:
+            if order == 2 and error <= PREDICTED / 8 * tolerance:
                 dearest = SLAB[2] * steps
             if steps == 1 or error > 4 * tolerance:
                 break
@@ -165,7 +169,7 @@ def side_ladder(scene: Scene, coarse: Fidelity, tolerance: float) -> list[Side]:
         return Side(width, math.sqrt(max(error**2 - fringes**2, 0.0)), fringes)
 
     narrower = [lost(0)]
-    if narrower[0].error(1) > MARGIN / 4 * tolerance and half < width:  # or none is needed
+    if narrower[0].error(1) > PREDICTED / 4 * tolerance and half < width:  # or none is needed
         narrower.append(lost(half))
     # the blur's tail falls off slowly: so much lies beyond the widest, and more where no sources average its rings
     part = 3 if len(parts) > 1 and directions(scene.microscope, AT_SIDES) >= AT_SIDES else 1

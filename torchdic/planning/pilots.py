@@ -13,6 +13,7 @@ from torchdic.forward.images import image
 from torchdic.grid import Grid
 from torchdic.instrument.condenser import Spectrum
 from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.planning.comparisons import TRUTH
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
@@ -65,10 +66,10 @@ class Scene:
         deepest = n0 * self.microscope.wavelength / (2 * na**2)
         steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
         while steps < MOST_UNSTABLE * self.slices:
-            yield Fidelity("wave", steps=steps, order=1)
-            yield Fidelity("wave", steps=steps)  # often carries light where the first order makes energy
+            yield Fidelity(TRUTH, steps=steps, order=1)
+            yield Fidelity(TRUTH, steps=steps)  # often carries light where the first order makes energy
             steps *= 2
-        yield Fidelity("wave", steps=MOST_UNSTABLE * self.slices)
+        yield Fidelity(TRUTH, steps=MOST_UNSTABLE * self.slices)
 
     def hardest(self) -> "Scene":
         """The scene with the hardest of its images, in two colours at most.

@@ -25,8 +25,9 @@ from torchdic.instrument.microscope import Acquisition, Microscope, check_apertu
 from torchdic.planning.cost import directions, seconds, work
 from torchdic.planning.effects import Climbed, Effect, counted, effects
 from torchdic.planning.image_error import relative
-from torchdic.planning.ladders import MARGIN, Choice, side_ladder, source_ladder, sparse, way_ladder
+from torchdic.planning.ladders import PREDICTED, Choice, side_ladder, source_ladder, sparse, way_ladder
 from torchdic.planning.pilots import Scene
+from torchdic.propagation.base import propagation_of
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
@@ -75,10 +76,7 @@ class Plan:
 
 def describe(fidelity: Fidelity) -> str:
     """A fidelity's choices in a line."""
-    parts = [f'"{fidelity.propagation}"']
-    if fidelity.propagation == "wave":
-        slabs = "a slab a slice" if fidelity.steps is None else counted(fidelity.steps, "slab")
-        parts.append(f"{slabs} of order {fidelity.order}")
+    parts = [f'"{fidelity.propagation}"', *propagation_of(fidelity).describe(fidelity)]
     parts.append(counted(fidelity.sources, "source"))
     if fidelity.padding:
         parts.append(f"{counted(fidelity.padding, 'voxel')} of padding")
@@ -110,9 +108,9 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
         worst = max(chosen.effects, key=lambda e: e.error)
         warnings.warn(
             f"no fidelity tried is sure to meet the tolerance {tolerance:g}, which takes a predicted error of "
-            f"{MARGIN * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
+            f"{PREDICTED * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
             f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for "
-            f"{_two_digits_up(chosen.error / MARGIN)}, or take finer voxels, a narrower condenser or wider sides",
+            f"{_two_digits_up(chosen.error / PREDICTED)}, or take finer voxels, a narrower condenser or wider sides",
             ToleranceWarning,
             stacklevel=3,
         )
@@ -134,7 +132,7 @@ def _plan(scene: Scene, tolerance: float) -> Plan:
             if finer is None:
                 raise
             coarse = finer
-    met = error <= MARGIN * tolerance
+    met = error <= PREDICTED * tolerance
     duration = seconds(scene.volume, scene.microscope, scene.acquisition, fidelity)
     return Plan(fidelity, worth, error, duration, tolerance, met, 0.0)
 
@@ -173,7 +171,7 @@ def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) ->
 
     strained = pilot.strained or climbed.pilot.strained
     tried = list(joined())
-    meeting = sorted((choice for choice in tried if choice[1] <= MARGIN * tolerance), key=cost)
+    meeting = sorted((choice for choice in tried if choice[1] <= PREDICTED * tolerance), key=cost)
     for choice in (*meeting, *sorted(tried, key=lambda choice: choice[1])):
         if not strained or pilot.carries(choice[0]):
             return choice

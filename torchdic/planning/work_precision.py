@@ -22,12 +22,14 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from torchdic.errors import TurnedRaysError, UnstableError
-from torchdic.fidelity import Fidelity, Propagation
+from torchdic.fidelity import Fidelity
 from torchdic.forward.images import image
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.planning.comparisons import TRUTH
 from torchdic.planning.cost import timed
 from torchdic.planning.image_error import image_error
+from torchdic.propagation.base import propagations
 from torchdic.specimen.volume import Volume
 
 T = TypeVar("T")
@@ -91,7 +93,7 @@ def work_precision(
     microscope: Microscope,
     acquisition: Acquisition,
     candidates: Sequence[Candidate | Fidelity],
-    reference: Candidate | Fidelity | Mapping[Propagation, Candidate | Fidelity],
+    reference: Candidate | Fidelity | Mapping[str, Candidate | Fidelity],
     *,
     exact: Float[Tensor, "prism focus y x"] | None = None,
     repeats: int = 3,
@@ -113,7 +115,7 @@ def trials(
     microscope: Microscope,
     acquisition: Acquisition,
     candidates: Sequence[Candidate | Fidelity],
-    reference: Candidate | Fidelity | Mapping[Propagation, Candidate | Fidelity],
+    reference: Candidate | Fidelity | Mapping[str, Candidate | Fidelity],
     *,
     exact: Float[Tensor, "prism focus y x"] | None = None,
     repeats: int = 3,
@@ -125,7 +127,7 @@ def trials(
         raise ValueError(f"repeats {repeats} must be at least 1")
     scene = _Scene(volume, microscope, acquisition)
     given = [c if isinstance(c, Candidate) else Candidate(c) for c in candidates]
-    needed = {"wave", *(candidate.fidelity.propagation for candidate in given)}
+    needed = {TRUTH, *(candidate.fidelity.propagation for candidate in given)}
     references = reference if isinstance(reference, Mapping) else dict.fromkeys(needed, reference)
     if missing := needed - set(references):
         raise ValueError(f"reference has none for propagation {min(missing)!r}, only for {', '.join(references)}")
@@ -144,7 +146,7 @@ def trials(
                 known[key] = None
         return known[key]
 
-    wave = converged(Fidelity("wave"))
+    wave = converged(Fidelity(TRUTH))
     assert wave is not None
     truth = wave.images if exact is None else exact.to(wave.images)
     if truth.shape != wave.images.shape:
@@ -193,28 +195,12 @@ def ladder(grid: Grid, *, padded: bool = True) -> list[Candidate]:
 
     padded: whether to try padding, which makes another scene of a specimen that reaches the sides.
     """
-    slices, margin = grid.shape[0], max(grid.shape[1:]) // 8 if padded else 0
-    rungs = [
-        Candidate(Fidelity("projection", sources=12)),
-        Candidate(Fidelity("projection")),
-        Candidate(Fidelity("rays", sources=12, steps=max(1, slices // 4))),
-        Candidate(Fidelity("rays", sources=24, steps=max(1, slices // 4))),
-        Candidate(Fidelity("wave", sources=12, steps=max(1, slices // 4))),
-        Candidate(Fidelity("wave", sources=12, order=1)),
-        Candidate(Fidelity("wave", sources=12)),
-        Candidate(Fidelity("wave", sources=24)),
-        Candidate(Fidelity("wave", steps=max(1, slices // 2))),
-        Candidate(Fidelity("wave")),
-        Candidate(Fidelity("wave"), "float64"),
-        Candidate(Fidelity("wave", padding=margin)),
-        Candidate(Fidelity("wave", steps=2 * slices)),
-        Candidate(Fidelity("wave", sources=72)),
-        Candidate(Fidelity("wave", steps=2 * slices, sources=72, padding=margin)),
-    ]
+    margin = max(grid.shape[1:]) // 8 if padded else 0
+    rungs = [Candidate(*rung) for propagation in propagations() for rung in propagation.rungs(grid, margin)]
     return list(dict.fromkeys(rungs))  # without padding two are alike
 
 
-def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> dict[Propagation, Fidelity]:
+def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid) -> dict[str, Fidelity]:
     """For each propagation numbers finer than its candidates': twice the steps, half as many sources again, splines.
 
     Sources are K rings of 2K: the same from opposite sides, which weak phase in bright field lives by.
@@ -222,8 +208,8 @@ def converged_fidelities(candidates: Sequence[Candidate | Fidelity], grid: Grid)
     shows, for it falls with their square.
     """
     given = [c.fidelity if isinstance(c, Candidate) else c for c in candidates]
-    found: dict[Propagation, Fidelity] = {}
-    used: list[Propagation] = ["wave", *(f.propagation for f in given)]
+    found: dict[str, Fidelity] = {}
+    used: list[str] = [TRUTH, *(f.propagation for f in given)]
     for propagation in dict.fromkeys(used):
         own = [f for f in given if f.propagation == propagation] or given
         steps = 2 * max(f.steps or grid.shape[0] for f in own)

@@ -4,7 +4,8 @@ It is the limit of the ray equations for weak contrast, where dW/dz = √(n² �
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Complex, Float
@@ -12,29 +13,74 @@ from torch import Tensor
 
 from torchdic.errors import TurnedRaysError
 from torchdic.fidelity import Fidelity
-from torchdic.memory.batches import Demand, indices, recompute, slabs
-from torchdic.plane_waves import axial_momentum
-from torchdic.specimen.interpolation import SliceSampler
-from torchdic.specimen.volume import Volume
+from torchdic.grid import Grid
+from torchdic.memory.batches import recompute
+from torchdic.memory.batches import slabs as ranges
+from torchdic.plane_waves import axial_momentum, to_spectrum
+from torchdic.propagation.base import Crossing, Propagation, ToSpectrum
+from torchdic.specimen.volume import SampledVolume, Volume
+
+# Work of a slice in FFTs of a field, measured on a CPU from 64² to 256² pixels.
+SLICE = {"linear": 5.0, "cubic": 90.0}
+
+
+class Projection(Propagation):
+    """Straight rays along each source's direction."""
+
+    name = "projection"
+
+    def prepare(self, volume: Volume, fidelity: Fidelity, plane: float, *, polarised: bool = False) -> "StraightRays":
+        """The straight rays through a volume."""
+        return StraightRays(volume.sampled(fidelity.interpolation), plane)
+
+    def work(self, grid: Grid, fidelity: Fidelity, *, absorbs: bool) -> float:
+        """Every slice is sampled once, and its absorption too."""
+        return grid.shape[0] * SLICE[fidelity.interpolation] * (2 if absorbs else 1)
+
+    def planned(self) -> Iterable[Fidelity]:
+        """The cheapest image of all."""
+        return [Fidelity(self.name)]
+
+    def rungs(self, grid: Grid, margin: int) -> Iterable[tuple[Fidelity, str | None]]:
+        """With few sources, and with the usual number."""
+        return [(Fidelity(self.name, sources=12), None), (Fidelity(self.name), None)]
+
+
+@dataclass(frozen=True, eq=False)
+class StraightRays(Crossing):
+    """Straight rays through a volume, seen at depth `plane` (µm)."""
+
+    volume: SampledVolume
+    plane: float
+
+    def spectrum(
+        self,
+        wavelength: float,
+        momentum: Float[Tensor, "source 2"],
+        *,
+        slabs: bool = False,
+        to_spectrum: ToSpectrum = to_spectrum,
+    ) -> Complex[Tensor, "source 1 y x"]:
+        """The spectrum of each source's envelope, see `Crossing.spectrum`."""
+        return to_spectrum(project(self.volume, wavelength, momentum, self.plane, slabs=slabs))[:, None]
 
 
 def project(
-    volume: Volume,
+    volume: SampledVolume,
     wavelength: float,
     momentum: Float[Tensor, "source 2"],
     plane: float,
-    fidelity: Fidelity,
-    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
+    *,
+    slabs: bool = False,
 ) -> Complex[Tensor, "source y x"]:
     """Each source's envelope as seen at depth `plane` (µm).
 
-    fields: `Volume.sampled`, where it serves several calls.
-    Raises TurnedRaysError where the index on a ray falls below its transverse momentum.
+    wavelength: in vacuum, µm. momentum: n·sinθ (y, x) of each source's direction. slabs: whether slices are summed
+    again in the backward pass, slab by slab. Raises TurnedRaysError where the index on a ray falls below its transverse
+    momentum.
     """
     grid, n0 = volume.grid, volume.background
-    fields = fields or volume.sampled(fidelity.interpolation)
-    samplers = [SliceSampler(grid, f.unbind(0), fidelity.interpolation) for f in fields]
-
+    index, *absorption = volume.samplers()
     y, x = (grid.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
     p0 = momentum[:, None, None, :]
     pz0 = axial_momentum(n0, p0)
@@ -45,36 +91,20 @@ def project(
         for i in range(first, last):
             z = grid.centre(0, i)
             position = (y[:, None] + vy * (z - plane)).expand(wide), (x + vx * (z - plane)).expand(wide)
-            delta = samplers[0].value(z, *position)
+            delta = index.value(z, *position)
             n = n0 + delta
             pz = axial_momentum(n, p0)
             change = [delta * (n + n0) / (pz + pz0)]
-            if len(samplers) == 2:
-                change.append(samplers[1].value(z, *position) * n / pz)
+            change += [kappa.value(z, *position) * n / pz for kappa in absorption]
             sums = tuple(s + grid.spacing[0] * c for s, c in zip(sums, change, strict=True))
         return sums
 
-    zero = momentum.new_zeros(wide)
-    sums = tuple(zero for _ in samplers)
-    steps = grid.shape[0]
-    crowded = demand_of_projection(volume, fidelity).whole * zero.numel() * zero.element_size() > fidelity.memory
-    for first, last in slabs(steps, split=crowded):
-        sums = recompute(cross, first, last, *sums, when=crowded)
+    sums = (momentum.new_zeros(wide),) * len(volume.fields)
+    for first, last in ranges(grid.shape[0], split=slabs):
+        sums = recompute(cross, first, last, *sums, when=slabs)
     stopped = ~torch.isfinite(sums[0].detach())
     if bool(stopped.any()):
         raise TurnedRaysError.of(stopped)
     k0 = 2 * math.pi / wavelength
     amplitude = torch.ones_like(sums[0]) if len(sums) == 1 else torch.exp(-k0 * sums[1])
     return torch.polar(amplitude, k0 * sums[0])
-
-
-def demand_of_projection(volume: Volume, fidelity: Fidelity) -> Demand:
-    """What `project` holds; measured by `python benchmarks/memory.py`."""
-    absorbs, index = volume.absorption is not None, indices(volume.delta.dtype)
-    steps = volume.grid.shape[0]
-    if fidelity.interpolation == "linear":
-        return Demand(10 + 2 * absorbs, 4 + absorbs, 10, steps, 8 + 2 * absorbs, 10, 1 + absorbs, shared=1)
-    # a spline's 16 voxels, their places and weights
-    working = 43 + 8 * index + 44 * absorbs
-    step = 14 + 16 * index + 2 * absorbs
-    return Demand(64 + 24 * index + 2 * absorbs, 4 + absorbs, working, steps, step, working, 1 + absorbs)

@@ -19,11 +19,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.scalar import number
 from torchdic.specimen.interpolation import window
-from torchdic.specimen.volume import Volume
+from torchdic.specimen.volume import SampledVolume
 
 
 class Tubes:
@@ -63,25 +62,17 @@ class Tubes:
 
 
 @torch.no_grad()
-def tubes_that_may_fold(
-    volume: Volume,
-    momentum: Float[Tensor, "source 2"],
-    fidelity: Fidelity,
-    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
-) -> Tubes | None:
+def tubes_that_may_fold(volume: SampledVolume, momentum: Float[Tensor, "source 2"]) -> Tubes | None:
     """Tubes to be followed through the volume, or None where there provably is no caustic in it.
-
-    fields: `Volume.sampled`, where it serves several calls.
 
     S = PQ⁻¹ obeys S' = −H_xx − H_xp S − S H_px − S H_pp S. So |S| is at most the solution of s' = c + 2a s + b s² where
     a, b, c bound |H_px|, |H_pp|, |H_xx| slice by slice. With s = p/q that is q' = −a q − b p, p' = c q + a p, from
     q = 1, p = 0. While q > 0, S is finite and Q has an inverse: a thin lens is cleared up to its very focus.
     """
     grid, n0 = volume.grid, number(volume.background)
-    field = (fields or volume.sampled(fidelity.interpolation))[0]
-    slices = torch.stack([_bounds(s, grid) for s in field.unbind(0)]).to("cpu", torch.float64)
+    slices = torch.stack([_bounds(s, grid) for s in volume.fields[0]]).to("cpu", torch.float64)
     faces = [grid.centre(0, i - 0.5) for i in range(grid.shape[0] + 1)]
-    seen = [window(grid, *ends, fidelity.interpolation) for ends in pairwise(faces)]
+    seen = [window(grid, *ends, volume.interpolation) for ends in pairwise(faces)]
     lowest, highest, gradient, curvature = torch.stack([slices[s].amax(0) for s in seen]).unbind(1)
     if not bool(curvature.any()):
         return None

@@ -1,4 +1,4 @@
-"""The right-hand side of the ray ODE (see `torchdic.rays`), and its derivative written out by hand.
+"""The right-hand side of the ray ODE (see `torchdic.rays.trace`), and its derivative written out by hand.
 
 Autograd would keep every intermediate value: some 27 for each ray and evaluation where the index is linear, 115 where
 it is a cubic spline. By hand the backward pass needs where a ray was and what it met there. With p = p0 + δp,
@@ -52,7 +52,7 @@ class RayEquation:
 
     def meet(self, z: float, moving: Float[Tensor, "4 *ray"]) -> "Met":
         """What rays meet at depth z."""
-        y, x = self._positions(z, moving)
+        y, x = self.positions(z, moving)
         kappa = None if self.absorption is None else self.absorption.value(z, y, x)
         return self.momenta(moving, self.index.sample(z, y, x), kappa)
 
@@ -137,7 +137,7 @@ class RayEquation:
         if turned_bar is not None:
             p_bar.add_(turned_bar)
 
-        y, x = self._positions(z, met.moving)
+        y, x = self.positions(z, met.moving)
         place_bar, index_plane_bar = self.index.pull_back(z, y, x, index_bar)
         planes_bar = [index_plane_bar]
         if self.absorption is not None and kappa_bar is not None:
@@ -156,7 +156,8 @@ class RayEquation:
             background_bar = n_bar.sum() - self.background * path_bar.sum()
         return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
 
-    def _positions(self, z: float, moving: Tensor) -> tuple[Tensor, Tensor]:
+    def positions(self, z: float, moving: Float[Tensor, "4 *ray"]) -> tuple[Float[Tensor, " *ray"], ...]:
+        """Where rays are at depth z: y and x in µm."""
         place, v, _, _ = self._unperturbed
         y, x = torch.add(place, v, alpha=z - self.face).add_(moving[:2]).unbind()
         return y, x

@@ -1,9 +1,10 @@
 """The rays of a source as a mesh of triangles, and the pixels on which each triangle lands."""
 
 import math
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchdic.errors import SidewaysError
@@ -11,7 +12,7 @@ from torchdic.grid import Grid
 from torchdic.scalar import scalar
 
 # Rows and columns of rays traced around the array, from where rays may be bent into it.
-MARGIN = 2
+SURROUND = 2
 
 # Array widths by which the outermost rays may be displaced: from farther away none knows the index that it crossed.
 FARTHEST = 2
@@ -35,10 +36,10 @@ class Mesh:
                 f"than {FARTHEST} times the {max(my, mx)} that are traced; a wider or thinner volume, or a "
                 "reference_plane nearer to the specimen, may help"
             )
-        extra = max(0, math.ceil(farthest) + 1 - MARGIN)
+        extra = max(0, math.ceil(farthest) + 1 - SURROUND)
         self._rows = torch.arange(-extra, my + extra, device=device)
         self._columns = torch.arange(-extra, mx + extra, device=device)
-        self.home = torch.cartesian_prod(self._rows, self._columns) - MARGIN
+        self.home = torch.cartesian_prod(self._rows, self._columns) - SURROUND
         vertex = torch.arange(len(self.home), device=device).reshape(my + 2 * extra, mx + 2 * extra)
         a, b, c, d = vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, :-1], vertex[1:, 1:]
         self.triangles = torch.stack((torch.stack((a, b, c), -1), torch.stack((d, c, b), -1)), 2).reshape(-1, 3)
@@ -65,8 +66,8 @@ class Mesh:
         corner = (self.home * self.spacing + self.flat(displacement))[:, self.triangles]
         return corner[:, :, 1:] - corner[:, :, :1]
 
-    def covered(self, displacement: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """All pairs of a triangle and a pixel inside it: source (n,), triangle (n,) and pixel (n, 2).
+    def covered(self, displacement: Tensor) -> "Pairs":
+        """All pairs of a triangle and a pixel inside it.
 
         A pixel on an edge belongs to one of the two triangles: an edge's side is computed from its vertices in the
         mesh's order, so both see the same number.
@@ -75,7 +76,7 @@ class Mesh:
         found = [self._covered_by_one(part) for part in self.home + self.flat(displacement) / self.spacing]
         triangles, pixels = zip(*found, strict=True)
         source = torch.cat([torch.full_like(triangle, i) for i, triangle in enumerate(triangles)])
-        return source, torch.cat(triangles), torch.cat(pixels)
+        return Pairs(source, torch.cat(triangles), torch.cat(pixels))
 
     def _covered_by_one(self, moved: Float[Tensor, "vertex 2"]) -> tuple[Tensor, Tensor]:
         """`covered` of one source, whose vertices have been moved to fractional pixels: triangle (n,), pixel (n, 2)."""
@@ -105,6 +106,22 @@ class Mesh:
             inside &= (left == (one < other)) == orientation
         held = inside.nonzero()[:, 0]
         return triangle[held], pixel[held]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of a triangle and a pixel (y, x) inside it, of each source's mesh."""
+
+    source: Int[Tensor, " pair"]
+    triangle: Int[Tensor, " pair"]
+    pixel: Int[Tensor, "pair 2"]
+
+    def summed(self, values: Shaped[Tensor, " pair"], sources: int, grid: Grid) -> Shaped[Tensor, "source y x"]:
+        """The sum of the values on each pixel of each source."""
+        ny, nx = grid.shape[1:]
+        target = (self.source * ny + self.pixel[:, 0]) * nx + self.pixel[:, 1]
+        field = values.new_zeros(sources * ny * nx).index_add(0, target, values)
+        return field.reshape(sources, ny, nx)
 
 
 def crossed_caustics(leaving: Tensor, landed: Tensor) -> Tensor:

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torchdiffeq import odeint
 
 from torchdic.fidelity import ADAPTIVE, Fidelity, Solver
 from torchdic.rays.equation import MOVING, Met, Pulled, RayEquation
@@ -50,9 +49,6 @@ def solve(
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in (state, *equation.tensors))
         return _EqualSteps.apply(equation, depths, fidelity.solver, keep, watch, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
-    def slopes(z: Tensor, state: Tensor) -> Tensor:
-        return _Evaluation.apply(equation, float(z), state, *equation.tensors)  # pyright: ignore[reportReturnType]
-
     # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after an
     # empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume. Its own choice
     # of a first step depends on the state, and gradients would run through the depths
@@ -60,16 +56,26 @@ def solve(
     options = {"norm": _largest, "first_step": slice_, "max_step": slice_}
     tolerance, method = fidelity.tolerance, fidelity.solver
     try:
-        path = odeint(
-            slopes, state, _ends(depths, state), rtol=tolerance, atol=tolerance, method=method, options=options
+        return _odeint(
+            lambda z, s: slopes(equation, z, s),
+            state,
+            depths,
+            rtol=tolerance,
+            atol=tolerance,
+            method=method,
+            options=options,
         )
-        return torch.as_tensor(path[-1])
     except AssertionError:
         # it gives up where a ray turns; equal steps leave nan there
         end = solve(equation, state, depths, replace(fidelity, solver="rk4"))
         if bool(torch.isfinite(end).all()):
             raise
         return end
+
+
+def slopes(equation: RayEquation, z: float, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
+    """d(state)/dz at depth z in µm, differentiable in the state and in the equation's tensors."""
+    return _Evaluation.apply(equation, z, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
 
 def equal_steps(
@@ -80,8 +86,7 @@ def equal_steps(
 ) -> Float[Tensor, "component *ray"]:
     """The state at the last of some depths by a method of `TABLEAUX`, a step from each depth to the next."""
     options = {"grid_constructor": lambda *_: depths}
-    path = odeint(lambda z, s: slopes(float(z), s), state, _ends(depths, state), method=solver, options=options)
-    return torch.as_tensor(path[-1])
+    return _odeint(slopes, state, depths, method=solver, options=options)
 
 
 class _EqualSteps(torch.autograd.Function):
@@ -239,9 +244,12 @@ def _maker(equation: RayEquation) -> Callable[[Sequence[Tensor]], tuple[RayEquat
     return make
 
 
-def _ends(depths: Tensor, state: Tensor) -> Tensor:
-    """What odeint asks for: it takes times that are not on the state's device."""
-    return depths[[0, -1]].to(state.device)
+def _odeint(slopes: Callable[[float, Tensor], Tensor], state: Tensor, depths: Tensor, **options: Any) -> Tensor:
+    """Torchdiffeq's solution at the last of some depths."""
+    from torchdiffeq import odeint  # only who traces rays loads it
+
+    ends = depths[[0, -1]].to(state.device)  # odeint takes no times that are on another device
+    return torch.as_tensor(odeint(lambda z, s: slopes(float(z), s), state, ends, **options)[-1])
 
 
 def _largest(state: Tensor) -> Tensor:

@@ -18,7 +18,8 @@ sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
     dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)),    without the singularity of s and p on the axis.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -28,12 +29,14 @@ from torch import Tensor
 from torchdic.errors import TurnedRaysError
 from torchdic.fidelity import ADAPTIVE, Fidelity
 from torchdic.grid import Grid
-from torchdic.memory.batches import recompute, slabs
+from torchdic.memory.batches import recompute
+from torchdic.memory.batches import slabs as ranges
+from torchdic.memory.held import crowded
 from torchdic.plane_waves import axial_momentum
 from torchdic.rays.equation import MOVING, RayEquation
-from torchdic.rays.solver import TABLEAUX, solve
-from torchdic.specimen.interpolation import SliceSampler, shares, window
-from torchdic.specimen.volume import Volume
+from torchdic.rays.solver import solve
+from torchdic.specimen.interpolation import shares
+from torchdic.specimen.volume import SampledVolume, Volume
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +87,11 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     """Rays from the volume's first face, z = −nz·dz/2, to its last, z = +nz·dz/2.
 
     Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (its momentum at the start, in the
-    background), and their `turn`, if they have one, by τ. Raises TurnedRaysError where a ray can't go on toward +z: the
-    index falls to its transverse momentum.
+    background), and their `turn`, if they have one, by τ. Of `fidelity` solver, tolerance, steps, interpolation and
+    memory are read. Raises TurnedRaysError where a ray can't go on toward +z: the index falls to its transverse
+    momentum.
     """
-    change = deviation(volume, rays, fidelity, turn=rays.turn is not None)
+    change = deviation(volume.sampled(fidelity.interpolation), rays, fidelity, turn=rays.turn is not None)
     slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
     absorbed = change.absorbed
     if absorbed is not None and rays.absorbed is not None:
@@ -102,82 +106,123 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
 
 
 def deviation(
-    volume: Volume,
+    volume: SampledVolume,
     rays: Rays,
     fidelity: Fidelity,
-    fields: Sequence[Float[Tensor, "z y x"]] | None = None,
     *,
+    start: float | None = None,
     turn: bool = False,
     watch: Callable[[Tensor], None] | None = None,
+    slabs: bool | None = None,
 ) -> Deviation:
-    """How rays that start at the volume's first face deviate from their unperturbed selves at its last; see `trace`.
+    """How rays deviate from their unperturbed selves at the volume's last face; see `trace`.
 
-    fields: `Volume.sampled`, where it serves several calls. turn: whether to find τ too. watch: is shown (δy, δx, δp_y,
-    δp_x), shape (4, …) and without a graph, after each step or, by an adaptive solver, at the slices' faces.
+    start: depth in µm of the plane in which the rays start; None is the first face. turn: whether to find τ too.
+    watch: is called with (δy, δx, δp_y, δp_x), shape (4, …) and without a graph, after each step or, by an adaptive
+    solver, at the slices' faces. slabs: whether steps are computed again in the backward pass, slab by slab; None is
+    where they would keep more than `fidelity.memory`.
     """
-    grid, n0 = volume.grid, volume.background
-    fields = fields or volume.sampled(fidelity.interpolation)
-    slices = [f.unbind(0) for f in fields]
-    face = -grid.extent[0] / 2
-    # y and x apart: the solution is spent on sums over pairs otherwise
-    position, momentum = (v.movedim(-1, 0) for v in torch.broadcast_tensors(rays.position, rays.momentum))
-    pz0 = axial_momentum(n0, rays.momentum).expand(momentum.shape[1:])
-    straight = torch.cat((position, momentum / pz0, momentum, pz0[None]))
-    shape = straight.shape[1:]  # laid out for the CPU's threads until the end
-    straight = straight.reshape(7, shares(grid, shape.numel(), straight.device), -1)
+    position, momentum = torch.broadcast_tensors(rays.position, rays.momentum)
+    flight = Flight(volume, position, momentum, fidelity, start=start, turn=turn, watch=watch)
+    return flight.deviation(fly(flight, fidelity.memory, slabs))
 
-    watched = 0
 
-    def show(step: int, moving: Tensor) -> None:
-        nonlocal watched
-        if watch is not None and step == watched:  # not when it is computed again
-            watch(moving.reshape(-1, *shape))
-            watched += 1
+class Flight:
+    """Rays on their way from a plane in a volume to its last face, step by step, in the state of `RayEquation`.
 
-    def cross(first: int, last: int, state: Tensor) -> Tensor:
-        if watch is None or equal_steps:
-            return advance(first, last, state)
+    steps: equal ones, or the stretches after each of which an adaptive solver is looked at.
+    shape: of the rays. straight: the unperturbed rays, see `RayEquation`.
+    """
+
+    def __init__(
+        self,
+        volume: SampledVolume,
+        position: Float[Tensor, "*ray 2"],
+        momentum: Float[Tensor, "*ray 2"],
+        fidelity: Fidelity,
+        *,
+        start: float | None = None,
+        turn: bool = False,
+        watch: Callable[[Tensor], None] | None = None,
+    ) -> None:
+        grid = volume.grid
+        face = grid.extent[0] / 2
+        self.volume, self.fidelity, self._turn = volume, fidelity, turn
+        self.equal_steps = fidelity.solver not in ADAPTIVE
+        self._start = -face if start is None else start
+        self._watch, self._watched = watch, 0
+        # y and x apart: the solution is spent on sums over pairs otherwise
+        place, p = position.movedim(-1, 0), momentum.movedim(-1, 0)
+        pz = axial_momentum(volume.background, momentum)
+        straight = torch.cat((place, p / pz, p, pz[None]))
+        self.shape = straight.shape[1:]
+        # laid out for the CPU's threads until the end
+        self.straight = straight.reshape(7, shares(grid, pz.numel(), straight.device), -1)
+        whole = (fidelity.steps if self.equal_steps else None) or grid.shape[0]
+        # a plane one rounding error above a step's end must not cost another step
+        self.steps = math.ceil(whole * (face - self._start) / grid.extent[0] - 1e-9)
+        # kept on the CPU: a depth read from another device would make every stage wait for it
+        edges = torch.arange(self.steps + 1, dtype=straight.dtype)
+        self._depths = self._start + (face - self._start) * edges / max(self.steps, 1)
+        self._depths[-1] = face
+
+    def beginning(self) -> Float[Tensor, "component *ray"]:
+        """The state of rays that do not deviate yet."""
+        components = MOVING + len(self.volume.fields) + self._turn
+        return self.straight.new_zeros(components, *self.straight.shape[1:])
+
+    def cross(self, first: int, last: int, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
+        """The state behind steps first … last − 1."""
+        if self._watch is None or self.equal_steps:
+            return self.advance(first, last, state)
         for step in range(first, last):
-            state = advance(step, step + 1, state)
-            show(step, state[:MOVING].detach())
+            state = self.advance(step, step + 1, state)
+            self._show(step, state[:MOVING].detach())
         return state
 
-    def advance(first: int, last: int, state: Tensor) -> Tensor:
-        times = depths[first : last + 1]
+    def advance(self, first: int, last: int, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
+        """As `cross`, in one go."""
+        equation, depths = self.equation(first, last)
+        return solve(equation, state, depths, self.fidelity, lambda step, moving: self._show(first + step, moving))
+
+    def equation(self, first: int, last: int) -> tuple[RayEquation, Float[Tensor, " depth"]]:
+        """The equation in steps first … last − 1, which holds their slices alone, and the depths of their ends."""
+        depths = self._depths[first : last + 1]
         # an adaptive solver looks beyond the end of its last step
-        seen = times if equal_steps else depths
-        near = window(grid, float(seen[0]), float(seen[-1]), fidelity.interpolation)
-        index, *absorption = (SliceSampler(grid, s[near], fidelity.interpolation, near.start) for s in slices)
+        seen = depths if self.equal_steps else self._depths
+        index, *absorption = self.volume.samplers((float(seen[0]), float(seen[-1])))
         kappa = absorption[0] if absorption else None
-        equation = RayEquation(straight, n0, index, kappa, face, turn)
-        return solve(equation, state, times, fidelity, lambda step, moving: show(first + step, moving))
+        return RayEquation(self.straight, self.volume.background, index, kappa, self._start, self._turn), depths
 
-    state = straight.new_zeros(4 + len(fields) + turn, *straight.shape[1:])
-    equal_steps = fidelity.solver not in ADAPTIVE
-    steps = steps_of(grid, fidelity)
-    # kept on the CPU: a depth read from another device would make every stage wait for it
-    depths = face + grid.extent[0] * torch.arange(steps + 1, dtype=state.dtype) / steps
-    depths[-1] = -face
-    kept = kept_by_rays(grid, fidelity, absorbs=volume.absorption is not None)
-    crowded = kept * state[0].numel() * state.element_size() > fidelity.memory
-    for first, last in slabs(steps, split=crowded and equal_steps):
-        state = recompute(cross, first, last, state, when=crowded)
-    state = state.reshape(len(state), *shape)
-    stopped = ~torch.isfinite(state[4])
-    if bool(stopped.any()):
-        raise TurnedRaysError.of(stopped)
-    position, momentum = state[:2].movedim(0, -1), state[2:4].movedim(0, -1)
-    absorbed = None if volume.absorption is None else state[5]
-    return Deviation(position, momentum, state[4], absorbed, state[-1] if turn else None)
+    def deviation(self, state: Float[Tensor, "component *ray"]) -> Deviation:
+        """What a state at the last face says. Raises TurnedRaysError where rays have stopped on their way."""
+        state = state.reshape(len(state), *self.shape)
+        stopped = ~torch.isfinite(state[MOVING])
+        if bool(stopped.any()):
+            raise TurnedRaysError.of(stopped)
+        return Deviation(
+            state[:2].movedim(0, -1),
+            state[2:MOVING].movedim(0, -1),
+            state[MOVING],
+            state[MOVING + 1] if self.volume.absorbs else None,
+            state[-1] if self._turn else None,
+        )
 
-
-def steps_of(grid: Grid, fidelity: Fidelity) -> int:
-    """Equal steps through the volume, or the stretches after each of which an adaptive solver is looked at."""
-    return (None if fidelity.solver in ADAPTIVE else fidelity.steps) or grid.shape[0]
+    def _show(self, step: int, moving: Tensor) -> None:
+        if self._watch is not None and step == self._watched:  # and not when the step is computed again
+            self._watch(moving.reshape(-1, *self.shape))
+            self._watched += 1
 
 
-def kept_by_rays(grid: Grid, fidelity: Fidelity, *, absorbs: bool = False) -> int:
-    """Values per ray that the backward pass keeps: where each step began, and what its evaluations sampled."""
-    # an adaptive solver keeps a state for each, and how many there are is known afterwards
-    evaluations = len(TABLEAUX[fidelity.solver][1]) if fidelity.solver in TABLEAUX else 6
-    return (4 + (3 + absorbs) * evaluations) * steps_of(grid, fidelity)
+def fly(flight: Flight, budget: int, slabs: bool | None = None) -> Float[Tensor, "component *ray"]:
+    """The state of rays at the last face.
+
+    slabs: whether steps are computed again in the backward pass, slab by slab; None is where they would keep more than
+    the budget in bytes.
+    """
+    state = flight.beginning()
+    if slabs is None:
+        slabs = flight.steps > 1 and crowded(lambda: flight.cross(0, 1, state), flight.steps, budget)
+    for first, last in ranges(flight.steps, split=slabs and flight.equal_steps):
+        state = recompute(flight.cross, first, last, state, when=slabs)
+    return state

@@ -1,12 +1,15 @@
 """The specimen: a learnable refractive index on a grid of voxels."""
 
+from dataclasses import dataclass
+
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchdic.grid import Grid
 from torchdic.scalar import number, scalar
-from torchdic.specimen.interpolation import Interpolation, spline_coefficients
+from torchdic.specimen.interpolation import Interpolation, SliceSampler, spline_coefficients, window
 
 
 class Volume(nn.Module):
@@ -53,10 +56,20 @@ class Volume(nn.Module):
         else:
             self.register_buffer(name, value)
 
-    def sampled(self, interpolation: Interpolation) -> list[Float[Tensor, "z y x"]]:
-        """Δn, and κ if there is any, as a `SliceSampler` wants them: voxels, or a spline's coefficients."""
+    def sampled(self, interpolation: Interpolation) -> "SampledVolume":
+        """The volume made ready to be sampled between its voxel centres."""
         fields = [self.delta] if self.absorption is None else [self.delta, self.absorption]
-        return [spline_coefficients(f) for f in fields] if interpolation == "cubic" else fields
+        if interpolation == "cubic":
+            fields = [spline_coefficients(f) for f in fields]
+        return SampledVolume(self.grid, self.background, tuple(f.unbind(0) for f in fields), interpolation)
+
+    def padded(self, margin: int) -> "Volume":
+        """The volume with `margin` voxels of the medium more on each side along y and x."""
+        if margin == 0:
+            return self
+        delta, absorption = (None if f is None else F.pad(f, (margin,) * 4) for f in (self.delta, self.absorption))
+        assert delta is not None
+        return Volume(self.grid.widened(margin, margin), delta, self.background, absorption)
 
     def mean_plane(self) -> float:
         """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 where Δn is 0 everywhere.
@@ -70,6 +83,30 @@ class Volume(nn.Module):
         depth = self.grid.coordinates(0, dtype=torch.float64, device=weight.device)
         index = round(2 * self.grid.index(0, float((weight * depth).sum()) / total)) / 2
         return self.grid.centre(0, index)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledVolume:
+    """A volume whose Δn and κ can be sampled between voxel centres. It is made once and serves every batch of sources.
+
+    grid: where the voxels are. background: index of the medium, 0-d. fields: the slices (y, x) of Δn, and those of κ
+    where the volume absorbs: the voxels themselves for "linear", a spline's coefficients for "cubic".
+    """
+
+    grid: Grid
+    background: Float[Tensor, ""]
+    fields: tuple[tuple[Float[Tensor, "y x"], ...], ...]
+    interpolation: Interpolation
+
+    @property
+    def absorbs(self) -> bool:
+        """Whether the volume has an absorption."""
+        return len(self.fields) > 1
+
+    def samplers(self, between: tuple[float, float] | None = None) -> list[SliceSampler]:
+        """A sampler of each field. between: two depths in µm; only the slices that they depend on are held then."""
+        near = slice(0, None) if between is None else window(self.grid, *between, self.interpolation)
+        return [SliceSampler(self.grid, slices[near], self.interpolation, near.start) for slices in self.fields]
 
 
 def _check_field(name: str, field: Tensor, grid: Grid) -> None:

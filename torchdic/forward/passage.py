@@ -1,0 +1,144 @@
+"""The light's way from a specimen to the images, in batches of sources."""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from torchdic.fidelity import Fidelity
+from torchdic.grid import Grid
+from torchdic.imaging.intensity import form_image
+from torchdic.imaging.passband import interpolate
+from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.memory.batches import sum_over_sources
+from torchdic.memory.budget import Batches
+from torchdic.object_aberration.levels import Levels, object_levels
+from torchdic.plane_waves import axial_difference, paraxial_difference, to_spectrum
+from torchdic.propagation.base import Crossing, propagation_of
+from torchdic.specimen.volume import Volume
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """From a volume to its images: what is made once and serves every batch of sources.
+
+    volume: padded. plane: depth in µm to which the crossing refers its light. levels: of the object aberration, one for
+    each colour; empty where the fidelity names none.
+    """
+
+    volume: Volume
+    microscope: Microscope
+    acquisition: Acquisition
+    fidelity: Fidelity
+    plane: float
+    crossing: Crossing
+    levels: tuple[Levels, ...]
+
+    @classmethod
+    def through(
+        cls, volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 2
+    ) -> "Passage":
+        """The passage of a volume that isn't padded yet; levels: of an object aberration at least."""
+        propagation = propagation_of(fidelity)
+        plane = propagation.reference_plane(volume, fidelity)
+        padded = volume.padded(fidelity.padding)
+        polarised = propagation.carries_polarisation and microscope.turns
+        crossing = propagation.prepare(padded, fidelity, plane, polarised=polarised)
+        found = ()
+        if fidelity.object_aberration is not None:
+            found = tuple(object_levels(padded, plane, part, fidelity, levels) for part, _ in microscope.colours())
+        return cls(padded, microscope, acquisition, fidelity, plane, crossing, found)
+
+    @property
+    def most_levels(self) -> int:
+        """Levels of the colour that has most; 0 where there are none."""
+        return max((len(levels.defocus) for levels in self.levels), default=0)
+
+    def images(self, batches: Batches) -> Float[Tensor, "prism focus y x"]:
+        """The images of all colours, whose sources are computed in batches."""
+        colours = self.microscope.colours()
+        levels = self.levels or (None,) * len(colours)
+        images = [share * self._image(part, own, batches) for (part, share), own in zip(colours, levels, strict=True)]
+        return images[0] if len(images) == 1 else torch.stack(images).sum(0)
+
+    def _image(
+        self, microscope: Microscope, levels: Levels | None, batches: Batches
+    ) -> Float[Tensor, "prism focus y x"]:
+        """The images in light of one wavelength."""
+        delta, n0, grid = self.volume.delta, self.volume.background, self.volume.grid
+
+        def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
+            def spread(field: Tensor) -> Tensor:
+                return to_spectrum(field) if levels is None else self._spread(field, levels, microscope, momentum)
+
+            wavelength, slabs = microscope.wavelength, batches.slabs
+            spectrum = self.crossing.spectrum(wavelength, momentum, slabs=slabs, to_spectrum=spread)
+            return form_image(
+                spectrum if spectrum.shape[1] > 1 else spectrum[:, 0],
+                grid,
+                n0,
+                self.plane,
+                momentum,
+                weights,
+                microscope,
+                self.acquisition,
+                self.fidelity.defocus,
+                band_limit=self.fidelity.band_limit,
+            )
+
+        sources = microscope.sources(self.fidelity.sources, dtype=delta.dtype, device=delta.device)
+        total = sum_over_sources(intensity, sources, batches.sources)
+        return seen(total, grid, self.fidelity.padding, microscope)
+
+    def _spread(self, field: Tensor, levels: Levels, microscope: Microscope, momentum: Tensor) -> Tensor:
+        """The spectrum of a field each of whose points has a defocus of its own."""
+        waves = self.volume.grid, microscope.wavelength, self.volume.background, momentum
+        paraxial = self.fidelity.defocus == "paraxial"
+        difference = paraxial_difference(*waves) if paraxial else axial_difference(*waves)[0]
+        return levels.spread(field, microscope.wavelength, difference)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPassage:
+    """From a field at z = 0 to its images.
+
+    transmission: (y, x), the same for every source, or (source, y, x). grid: its pixels, without padding. background:
+    index of the medium, 0-d.
+    """
+
+    transmission: Complex[Tensor, "*source y x"]
+    grid: Grid
+    background: Float[Tensor, ""]
+    microscope: Microscope
+    acquisition: Acquisition
+    fidelity: Fidelity
+
+    def images(self, batches: Batches) -> Float[Tensor, "prism focus y x"]:
+        """The images, whose sources are computed in batches."""
+        pad, real = self.fidelity.padding, self.transmission.real
+        grid = self.grid.widened(pad, pad)
+        spectra = to_spectrum(F.pad(self.transmission, (pad,) * 4, value=1.0))
+        momentum, weights = self.microscope.sources(self.fidelity.sources, dtype=real.dtype, device=real.device)
+
+        def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
+            scene = self.microscope, self.acquisition, self.fidelity.defocus
+            waves = spectra, grid, self.background, 0.0, momentum, weights
+            return form_image(*waves, *scene, band_limit=self.fidelity.band_limit)
+
+        own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
+        total = sum_over_sources(intensity, (momentum, weights, own), batches.sources)
+        return seen(total, grid, pad, self.microscope)
+
+
+def seen(
+    images: Float[Tensor, "prism focus row column"], grid: Grid, padding: int, microscope: Microscope
+) -> Float[Tensor, "prism focus y x"]:
+    """Images on a padded grid's pixels without their padding, or on the camera's pixels if it has any."""
+    _, ny, nx = grid.shape
+    images = interpolate(images, (ny, nx))
+    camera = microscope.camera
+    if camera is not None and camera.pixel_size is not None:
+        return camera.integrate(images, grid.spacing[1:], (ny - 2 * padding, nx - 2 * padding))
+    return images if padding == 0 else images[..., padding:-padding, padding:-padding]

@@ -1,0 +1,41 @@
+"""What of some values decides how much memory a computation with them holds."""
+
+from collections.abc import Hashable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import TypeVar
+
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+def signature(part: object) -> Hashable:
+    """A key of a number, tensor, dataclass, sequence or mapping.
+
+    Of a tensor it holds the shape, the dtype and whether it is learned. Computations with two parts of the
+    same signature hold the same memory.
+    """
+    if isinstance(part, Tensor):
+        return tuple(part.shape), part.dtype, part.requires_grad
+    if isinstance(part, Mapping):
+        return tuple((key, signature(value)) for key, value in part.items())
+    if isinstance(part, list | tuple):
+        return tuple(map(signature, part))
+    if is_dataclass(part):
+        return type(part).__name__, tuple(signature(getattr(part, field.name)) for field in fields(part))
+    assert isinstance(part, Hashable)
+    return part
+
+
+def stand_in(part: T) -> T:
+    """A copy on the CPU whose tensors are leaves of their own: a gradient to them leaves the part as it is."""
+    if isinstance(part, Tensor):
+        return part.detach().cpu().clone().requires_grad_(part.requires_grad)  # pyright: ignore[reportReturnType]
+    if isinstance(part, Mapping):
+        return {key: stand_in(value) for key, value in part.items()}  # pyright: ignore[reportReturnType]
+    if isinstance(part, list | tuple):
+        return type(part)(map(stand_in, part))
+    if is_dataclass(part) and not isinstance(part, type):
+        values = {field.name: getattr(part, field.name) for field in fields(part) if field.init}
+        return replace(part, **{name: stand_in(value) for name, value in values.items()})
+    return part
