@@ -167,7 +167,7 @@ def _in_model_unit(
     if lowest <= 0 and (scale == "background" or (flatten and not is_extinct)):
         raise StackError(
             f"{label}'s background minus the offset {offset:g} falls to {lowest:.4g}; "
-            "a background that divides the images must be above 0"
+            "a background that divides the images must stay above 0"
         )
     unit = level / expected if scale == "background" else scale
     scaled = np.empty(images.shape, np.float32)
