@@ -6,10 +6,11 @@ import pytest
 from scipy import ndimage
 
 from recon.recording.background import background_surface, noise_level
-from recon.recording.preparation import prepare
+from recon.recording.preparation import ExpectedStack, Normalisation, prepare
 from recon.recording.shear_axis import estimate_shear_axis
 from torchdic.errors import StackError, StackWarning
-from torchdic.files.stack import Stack, read_stack, write_stack
+from torchdic.files.format import Stack
+from torchdic.files.stack import read_stack, write_stack
 
 RIGHT = math.pi / 2
 
@@ -42,29 +43,36 @@ def counts(bias=RIGHT, shape=(96, 120), planes=3, brightness=8000.0, dark=100.0)
     return np.round(brightness * tilted(shape) * truth + dark).astype(np.uint16), truth
 
 
+def prepared(stack, biases, focus, pixel_size=None, *, pixels=None, empty=None, **normalisation):
+    """The stack in the model's unit, prepared for prisms of these biases and these focus planes."""
+    empty = None if empty is None else tuple(empty)
+    expected = ExpectedStack(tuple(biases), tuple(focus), pixel_size, pixels, empty)
+    return prepare(stack, expected, Normalisation(**normalisation))
+
+
 # counts and sizes
 
 
 def test_prisms_and_planes_must_be_as_many_as_the_acquisition_says():
     stack = Stack(np.ones((3, 5, 4, 4), np.float32), source="stack.tif")
     with pytest.raises(StackError) as caught:
-        prepare(stack, [1.0, -1.0], range(9), (0.1, 0.1))
+        prepared(stack, [1.0, -1.0], range(9), (0.1, 0.1))
     assert str(caught.value) == "stack.tif holds 3 prisms × 5 planes, the acquisition says 2 × 9"
     with pytest.raises(StackError, match="1 prism × 1 plane, the acquisition says 1 × 2"):
-        prepare(Stack(np.ones((1, 1, 4, 4), np.float32)), [None], [0.0, 1.0], (0.1, 0.1))
+        prepared(Stack(np.ones((1, 1, 4, 4), np.float32)), [None], [0.0, 1.0], (0.1, 0.1))
 
 
 def test_pixels_must_be_as_many_as_the_volumes():
     stack = Stack(np.ones((1, 1, 4, 6), np.float32), source="stack.tif")
     with pytest.raises(StackError, match=r"stack\.tif has 4 × 6 pixels \(y × x\), the volume 6 × 4"):
-        prepare(stack, [None], [0.0], (0.1, 0.1), pixels=(6, 4))
-    assert prepare(stack, [None], [0.0], (0.1, 0.1), pixels=(4, 6)).data.shape == (1, 1, 4, 6)
+        prepared(stack, [None], [0.0], (0.1, 0.1), pixels=(6, 4))
+    assert prepared(stack, [None], [0.0], (0.1, 0.1), pixels=(4, 6)).data.shape == (1, 1, 4, 6)
 
 
 @pytest.mark.parametrize(("shape", "planes"), [((8, 6), 1), ((3, 8, 6), 3)])
 def test_a_single_image_is_a_stack_of_one_plane(tmp_path, shape, planes):
     write_stack(tmp_path / "image.ome.tif", np.full(shape, 0.5, np.float32))
-    ready = prepare(read_stack(tmp_path / "image.ome.tif"), [RIGHT], range(planes), (0.1, 0.1))
+    ready = prepared(read_stack(tmp_path / "image.ome.tif"), [RIGHT], range(planes), (0.1, 0.1))
     assert ready.data.shape == (1, planes, 8, 6)
     assert ready.focus == tuple(range(planes))
 
@@ -72,33 +80,33 @@ def test_a_single_image_is_a_stack_of_one_plane(tmp_path, shape, planes):
 def test_the_configs_pixel_size_wins_and_a_difference_is_warned_of():
     stack = Stack(np.ones((1, 1, 4, 4), np.float32), pixel_size=(0.11, 0.12), source="stack.tif")
     with pytest.warns(StackWarning) as caught:
-        assert prepare(stack, [None], [0.0], (0.2, 0.12)).pixel_size == (0.2, 0.12)
+        assert prepared(stack, [None], [0.0], (0.2, 0.12)).pixel_size == (0.2, 0.12)
     (warning,) = caught
     assert "0.11 × 0.12 µm" in str(warning.message)
     assert "0.2 × 0.12 µm" in str(warning.message)
-    assert prepare(stack, [None], [0.0], (0.1108, 0.1195)).pixel_size == (0.1108, 0.1195)  # within 1 %
-    assert prepare(stack, [None], [0.0]).pixel_size == (0.11, 0.12)
+    assert prepared(stack, [None], [0.0], (0.1108, 0.1195)).pixel_size == (0.1108, 0.1195)  # within 1 %
+    assert prepared(stack, [None], [0.0]).pixel_size == (0.11, 0.12)
 
 
 def test_a_pixel_size_must_come_from_somewhere():
     with pytest.raises(StackError, match="neither the file nor the config"):
-        prepare(Stack(np.ones((1, 1, 4, 4), np.float32)), [None], [0.0])
+        prepared(Stack(np.ones((1, 1, 4, 4), np.float32)), [None], [0.0])
 
 
 @pytest.mark.parametrize("focus", [(-0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (1.0, 1.502, 2.0)])
 def test_a_focus_step_that_agrees_is_not_mentioned(focus):
-    prepare(Stack(np.ones((1, 3, 4, 4), np.float32), focus_step=0.5), [None], focus, (0.1, 0.1))
+    prepared(Stack(np.ones((1, 3, 4, 4), np.float32), focus_step=0.5), [None], focus, (0.1, 0.1))
 
 
 @pytest.mark.parametrize(("focus", "said"), [((-0.4, 0.0, 0.4), "0.4 µm"), ((0.0, 0.5, 1.5), "0.5 to 1 µm")])
 def test_a_focus_step_that_differs_is_warned_of(focus, said):
     stack = Stack(np.ones((1, 3, 4, 4), np.float32), focus_step=0.5, source="stack.tif")
     with pytest.warns(StackWarning, match=rf"stack\.tif: its focus step is 0\.5 µm, the config's {said}"):
-        assert prepare(stack, [None], focus, (0.1, 0.1)).focus == focus
+        assert prepared(stack, [None], focus, (0.1, 0.1)).focus == focus
 
 
 def test_a_focus_step_means_nothing_to_one_plane():
-    prepare(Stack(np.ones((1, 1, 4, 4), np.float32), focus_step=0.5), [None], [3.0], (0.1, 0.1))
+    prepared(Stack(np.ones((1, 1, 4, 4), np.float32), focus_step=0.5), [None], [3.0], (0.1, 0.1))
 
 
 # the model's unit
@@ -106,7 +114,7 @@ def test_a_focus_step_means_nothing_to_one_plane():
 
 def test_floats_are_left_alone():
     data = np.random.default_rng(0).uniform(0.1, 1.2, (2, 3, 8, 6)) * tilted((8, 6))
-    ready = prepare(Stack(data), [0.0, None], range(3), (0.1, 0.1))
+    ready = prepared(Stack(data), [0.0, None], range(3), (0.1, 0.1))
     assert ready.data.dtype == np.float32
     assert np.array_equal(ready.data, data.astype(np.float32))
     assert [report.scale for report in ready.prisms] == [1.0, 1.0]
@@ -116,15 +124,15 @@ def test_floats_are_left_alone():
 def test_floats_that_look_like_counts_are_warned_of():
     stack = Stack(np.full((1, 1, 8, 6), 1234.0), source="stack.tif")
     with pytest.warns(StackWarning, match=r"stack\.tif: prism 0's background is 1234, not 0\.5"):
-        prepare(stack, [RIGHT], [0.0], (0.1, 0.1))
-    assert prepare(stack, [RIGHT], [0.0], (0.1, 0.1), scale=2468.0).data == pytest.approx(0.5)
-    assert prepare(stack, [RIGHT], [0.0], (0.1, 0.1), scale="background").data == pytest.approx(0.5)
+        prepared(stack, [RIGHT], [0.0], (0.1, 0.1))
+    assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale=2468.0).data == pytest.approx(0.5)
+    assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale="background").data == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("bias", [None, math.pi, RIGHT, -RIGHT, 0.5])
 def test_an_empty_field_of_counts_becomes_sin2_half_bias(bias):
     empty = np.round(30000 * tilted((40, 60)) + 100).astype(np.uint16)[None, None]
-    ready = prepare(Stack(empty), [bias], [0.0], (0.1, 0.1), offset=100)
+    ready = prepared(Stack(empty), [bias], [0.0], (0.1, 0.1), offset=100)
     expected = 1.0 if bias is None else math.sin(bias / 2) ** 2
     rounding = 0.5 / (30000 * tilted((40, 60)).min())
     assert np.abs(ready.data / expected - 1).max() < 2 * rounding  # of the pixel itself, and of the fit
@@ -137,7 +145,7 @@ def test_an_empty_field_of_counts_becomes_sin2_half_bias(bias):
 @pytest.mark.parametrize("bias", [None, RIGHT, -RIGHT, 2.5])
 def test_counts_of_a_specimen_come_back_in_the_models_unit(bias):
     camera, truth = counts(bias)
-    ready = prepare(Stack(camera[None]), [bias], range(3), (0.1, 0.1), offset=100)
+    ready = prepared(Stack(camera[None]), [bias], range(3), (0.1, 0.1), offset=100)
     # the specimen fills half of the field; where it meets the border it bends the background by a few percent
     empty = np.median(truth)
     assert np.abs(ready.data[0] - truth).max() < 0.03 * empty
@@ -147,7 +155,7 @@ def test_counts_of_a_specimen_come_back_in_the_models_unit(bias):
 def test_each_prism_is_scaled_by_its_own_background():
     first, truth_first = counts(RIGHT, brightness=8000)
     second, truth_second = counts(math.pi, brightness=2000)
-    ready = prepare(Stack(np.stack([first, second])), [RIGHT, math.pi], range(3), (0.1, 0.1), offset=100)
+    ready = prepared(Stack(np.stack([first, second])), [RIGHT, math.pi], range(3), (0.1, 0.1), offset=100)
     assert np.abs(ready.data[0] - truth_first).max() < 0.03 * 0.5
     assert np.abs(ready.data[1] - truth_second).max() < 0.03
     assert ready.prisms[0].scale / ready.prisms[1].scale == pytest.approx(4, rel=1e-3)
@@ -156,14 +164,14 @@ def test_each_prism_is_scaled_by_its_own_background():
 def test_flattening_takes_out_the_tilt_and_leaves_the_specimen():
     camera, truth = counts()
     stack = Stack(camera[None])
-    flat = prepare(stack, [RIGHT], range(3), (0.1, 0.1), offset=100).data[0]
-    tilt = prepare(stack, [RIGHT], range(3), (0.1, 0.1), offset=100, flatten=False).data[0]
+    flat = prepared(stack, [RIGHT], range(3), (0.1, 0.1), offset=100).data[0]
+    tilt = prepared(stack, [RIGHT], range(3), (0.1, 0.1), offset=100, flatten=False).data[0]
     assert np.abs(flat - truth).max() < 0.1 * np.abs(tilt - truth).max()
 
 
 def test_a_given_scale_keeps_the_measured_background():
     stack = Stack(np.full((1, 1, 8, 6), 400, np.uint16))
-    ready = prepare(stack, [RIGHT], [0.0], (0.1, 0.1), scale=1000, offset=100)
+    ready = prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale=1000, offset=100)
     assert ready.data == pytest.approx(0.3)
     assert ready.prisms[0].background == pytest.approx(300)
 
@@ -175,19 +183,19 @@ def test_counts_at_extinction_need_a_scale(bias):
     light[10:14, 20:25] = 500
     stack = Stack((stray + light).astype(np.uint16)[None, None], source="stack.tif")
     with pytest.raises(StackError, match=r"stack\.tif: prism 0 .*too dark to scale by; give scale"):
-        prepare(stack, [bias], [0.0], (0.1, 0.1))
-    ready = prepare(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100)
+        prepared(stack, [bias], [0.0], (0.1, 0.1))
+    ready = prepared(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100)
     # stray light is additive: subtracted, so that the specimen's own light stays what it was, on the model's background
     empty = math.sin(bias / 2) ** 2
     assert np.abs(ready.data[0, 0] - empty - light / 1000).max() < 1.0 / 1000  # rounding and the fit of it, in counts
-    leaking = prepare(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100, empty=[8e-4])
+    leaking = prepared(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100, empty=[8e-4])
     assert leaking.data - ready.data == pytest.approx(8e-4 - empty, abs=1e-7)
 
 
 def test_a_background_must_be_above_the_offset():
     camera, _ = counts(dark=100)
     with pytest.raises(StackError, match=r"offset 5000 falls to -.*above 0"):
-        prepare(Stack(camera[None]), [RIGHT], range(3), (0.1, 0.1), offset=5000)
+        prepared(Stack(camera[None]), [RIGHT], range(3), (0.1, 0.1), offset=5000)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +210,7 @@ def test_a_background_must_be_above_the_offset():
 )
 def test_options_that_mean_nothing_are_refused(option, law):
     with pytest.raises(StackError, match=law):
-        prepare(Stack(np.ones((1, 1, 8, 8), np.uint8)), [None], [0.0], (0.1, 0.1), **option)
+        prepared(Stack(np.ones((1, 1, 8, 8), np.uint8)), [None], [0.0], (0.1, 0.1), **option)
 
 
 @pytest.mark.parametrize(("dtype", "bits", "top"), [("uint8", None, 255), ("uint16", 12, 4095), ("int16", 16, 32767)])
@@ -210,10 +218,10 @@ def test_saturated_pixels_are_counted(dtype, bits, top):
     data = np.full((1, 1, 20, 20), top // 2, dtype)
     data[0, 0, 0, :4] = top
     quiet = Stack(data.copy(), bits=bits)
-    prepare(quiet, [None], [0.0], (0.1, 0.1))  # 1 % is no more than 1 %
+    prepared(quiet, [None], [0.0], (0.1, 0.1))  # 1 % is no more than 1 %
     data[0, 0, 0, :8] = top
     with pytest.warns(StackWarning, match=rf"8 of 400 pixels \(2\.0%\) are saturated at {top}"):
-        prepare(Stack(data, bits=bits), [None], [0.0], (0.1, 0.1))
+        prepared(Stack(data, bits=bits), [None], [0.0], (0.1, 0.1))
 
 
 # background and noise
@@ -308,7 +316,7 @@ def test_a_measured_dic_image_shows_its_shear_axis_its_tilt_and_its_noise(measur
     assert stack.saturation == 255
     assert apart(estimate_shear_axis(stack.data[0, 0]).angle, math.radians(142.7)) < 4  # measured by hand
     with warnings.catch_warnings(record=True) as caught:
-        ready = prepare(stack, [RIGHT], [0.0], (0.1, 0.1))
+        ready = prepared(stack, [RIGHT], [0.0], (0.1, 0.1))
     assert not caught  # 0.04 % saturated
     surface = background_surface(stack.data[0, 0])
     assert (surface[-1, 0], surface[0, -1]) == pytest.approx((97, 160), abs=3)  # counts, corner to corner
@@ -323,7 +331,7 @@ def test_a_measured_imagej_stack_of_escaped_micrometres(measured_file):
     assert stack.data.shape == (1, 21, 165, 157)
     assert stack.pixel_size == pytest.approx((0.11, 0.11), rel=1e-4)
     assert stack.focus_step == pytest.approx(0.1)
-    ready = prepare(stack, [None], [0.1 * i for i in range(21)], (0.11, 0.11))
+    ready = prepared(stack, [None], [0.1 * i for i in range(21)], (0.11, 0.11))
     assert np.median(ready.data) == pytest.approx(1, abs=0.02)
 
 

@@ -8,7 +8,8 @@ import torch
 
 from torchdic import Grid
 from torchdic.errors import StackError, StackWarning
-from torchdic.files.stack import Stack, read_stack, read_volume, write_stack, write_volume
+from torchdic.files.format import Stack
+from torchdic.files.stack import read_stack, read_volume, write_stack, write_volume
 
 SHAPES = {"4-D": (2, 3, 9, 7), "3-D": (3, 9, 7), "2-D": (9, 7)}
 CODECS = [None, "lzw", "zlib"]

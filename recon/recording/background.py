@@ -1,11 +1,11 @@
-"""The slow background and the noise of an image, found in spite of the specimen in it."""
+"""The slow background and the noise of an image that also shows a specimen."""
 
 import math
 
 import numpy as np
 from jaxtyping import Float, Real
 
-_BLOCKS = 64  # the background is smooth: its fit sees block means, at most this many along an axis
+_BLOCKS = 64  # the background is smooth, so it is fitted to block means, at most this many along an axis
 
 _TUKEY = 4.685  # Tukey's biweight: 95 % efficient on Gaussian noise
 
@@ -13,25 +13,40 @@ _NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
 
 
 def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[np.ndarray, "y x"]:
-    """The slow background of an image (y, x), in its unit: a polynomial surface of total degree `order`.
+    """The slow background of an image: a polynomial surface of total degree `order`.
 
-    Fitted to block means by least absolute deviations, then by least squares with Tukey's biweight, each
-    reweighted until it stands still: a specimen that stands out of the noise and leaves most of the field
-    empty loses its say. Returns float64 of the image's shape.
+    image: (y, x), in any unit.
+    order: 0 is a constant, 1 a tilted plane, 2 a curved surface.
+
+    Returns the surface (y, x) in the image's unit, float64. It is fitted to the means of blocks of pixels by least
+    absolute deviations, then by least squares with Tukey's biweight; both are reweighted until the coefficients no
+    longer change. A specimen that stands out of the noise and leaves most of the field empty hardly bends it.
     """
-    ny, nx = image.shape
-    by, bx = math.ceil(ny / _BLOCKS), math.ceil(nx / _BLOCKS)
-    ky, kx = ny // by, nx // bx
-    blocks = image[: ky * by, : kx * bx].astype(np.float64).reshape(ky, by, kx, bx)
-    values = blocks.mean(axis=(1, 3)).ravel()
-    middle = float(np.median(values))  # keeps digits where a bright background is nearly flat
+    values, rows, columns = _block_means(image)
+    middle = float(np.median(values))  # subtracted to keep digits where a bright background is nearly flat
     values -= middle
-    rows, columns = (np.arange(ky) + 0.5) * by - 0.5, (np.arange(kx) + 0.5) * bx - 0.5
-    basis = _polynomials(rows, columns, (ny, nx), order)
+    basis = _polynomials(rows, columns, image.shape, order)
     basis = basis.reshape(len(basis), -1).T
     rounding = 100 * np.finfo(np.float64).eps * max(abs(middle), float(np.abs(values).max()))
+    coefficients = _robust_fit(basis, values, rounding)
+    ny, nx = image.shape
+    surface = _polynomials(np.arange(ny), np.arange(nx), (ny, nx), order)
+    return middle + np.tensordot(coefficients, surface, axes=1)
+
+
+def _block_means(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means of equal blocks of pixels, row by row, and the pixel indices of the blocks' centres along y and x."""
+    by, bx = (math.ceil(n / _BLOCKS) for n in image.shape)
+    ky, kx = image.shape[0] // by, image.shape[1] // bx
+    blocks = image[: ky * by, : kx * bx].astype(np.float64).reshape(ky, by, kx, bx)
+    rows, columns = (np.arange(ky) + 0.5) * by - 0.5, (np.arange(kx) + 0.5) * bx - 0.5
+    return blocks.mean(axis=(1, 3)).ravel(), rows, columns
+
+
+def _robust_fit(basis: np.ndarray, values: np.ndarray, rounding: float) -> np.ndarray:
+    """Coefficients of a fit that outliers hardly move. Residuals below `rounding` count as none."""
     coefficients = _weighted_fit(basis, values, np.ones_like(values))
-    # biweights alone would keep what plain least squares has bent to; absolute deviations bend less
+    # biweights alone would stay near the plain least-squares fit, which outliers bend; absolute deviations bend less
     for weight in (_absolute, _biweight):
         for _ in range(100):
             residual = np.abs(values - basis @ coefficients)
@@ -42,31 +57,33 @@ def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[
             coefficients = _weighted_fit(basis, values, weight(residual / typical))
             if np.abs(coefficients - previous).max() < 1e-4 * typical:
                 break
-    surface = _polynomials(np.arange(ny), np.arange(nx), (ny, nx), order)
-    return middle + np.tensordot(coefficients, surface, axes=1)
+    return coefficients
 
 
 def _weighted_fit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Coefficients of weighted least squares, from the Gram matrix: Legendre's is near diagonal."""
+    """Coefficients of weighted least squares, from the Gram matrix, which Legendre polynomials keep near diagonal."""
     weighted = basis * weight[:, None]
     return np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
 
 
 def _absolute(residual: np.ndarray) -> np.ndarray:
-    """Weights of least absolute deviations; residuals are relative to their median."""
+    """Weights of least absolute deviations. residual: relative to the median residual."""
     return 1 / np.maximum(residual, 1e-3)
 
 
 def _biweight(residual: np.ndarray) -> np.ndarray:
-    """Tukey's weights; residuals are relative to their median."""
+    """Tukey's biweights. residual: relative to the median residual."""
     return np.clip(1 - (residual * (_NORMAL_MAD / _TUKEY)) ** 2, 0, None) ** 2
 
 
 def noise_level(images: Real[np.ndarray, "*planes y x"]) -> float | None:
-    """The standard deviation of the noise in images (..., y, x), in their unit; None below 3 × 3 pixels.
+    """The standard deviation of the noise in images; None for images of less than 3 × 3 pixels.
 
-    From the median magnitude under a mask that is blind to anything smooth (Immerkær, Computer Vision
-    and Image Understanding 64, 300, 1996; his mean is a median here, for the sake of edges).
+    images: (..., y, x), in any unit, which is the result's unit too.
+
+    The images are filtered with a mask that gives 0 for anything smooth, and the noise follows from the median
+    magnitude of the result (Immerkær, Computer Vision and Image Understanding 64, 300, 1996, who takes the mean;
+    edges of the specimen move the median less).
     """
     if min(images.shape[-2:]) < 3:
         return None

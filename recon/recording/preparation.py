@@ -1,36 +1,98 @@
-"""A measured stack in the model's unit: checked against the acquisition, flattened and scaled."""
+"""A measured stack is checked against the acquisition and brought to the model's unit: flattened and scaled."""
 
 import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Float
 
 from recon.recording.background import background_surface, noise_level
 from torchdic.errors import StackError, StackWarning
-from torchdic.files.stack import Stack
+from torchdic.files.format import Stack
 
-_TOLERANCE = 0.01  # relative difference between the file's sizes and the config's that passes without a word
+_TOLERANCE = 0.01  # a larger relative difference between the file's sizes and the configuration's is warned of
 
-_SATURATED = 0.01  # fraction of saturated pixels that passes without a word
+_SATURATED = 0.01  # a larger fraction of saturated pixels is warned of
 
-_EXTINCT = 1e-3  # an emptier background than this is darkness: stray light and dark counts outweigh it
+_EXTINCT = 1e-3  # where the empty field should be darker than this, stray light and dark counts are brighter than it
 
-_BRIGHT = 1.5  # no empty background exceeds 1, the empty bright field, by so much
+_BRIGHT = 1.5  # a background brighter than this many empty bright fields is warned of; none should exceed 1
+
+
+@dataclass(frozen=True)
+class ExpectedStack:
+    """What a stack must hold to belong to an acquisition.
+
+    biases: one per prism, rad; None is bright field.
+    focus: one per plane, µm.
+    pixel_size: (y, x) in µm, used in place of the file's; None uses the file's.
+    pixels: (y, x), the number of pixels; None accepts any.
+    empty: one per prism, the intensity of the empty field, relative to the empty bright field; None is what ideal
+        polarisers give, sin²(bias/2), and 1 in bright field.
+    """
+
+    biases: tuple[float | None, ...]
+    focus: tuple[float, ...]
+    pixel_size: tuple[float, float] | None = None
+    pixels: tuple[int, int] | None = None
+    empty: tuple[float, ...] | None = None
+
+    @property
+    def empty_levels(self) -> tuple[float, ...]:
+        """The intensity of the empty field of each prism, relative to the empty bright field."""
+        return tuple(map(_ideal_empty_field, self.biases)) if self.empty is None else self.empty
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """How the file's pixel values become intensities relative to the empty bright field.
+
+    flatten: whether to divide by the slow background of each prism. The background of an extinct prism (an expected
+        empty field below 1e-3) is stray light; it is subtracted and the expected empty field put in its place. None
+        flattens integers and leaves floats as they are.
+    scale: the pixel value, offset removed, of an empty bright field of which the objective stops no light; or
+        "background", which takes it from the background and the expected empty field. None is "background" for
+        integers and 1 for floats, which are relative to the empty bright field already.
+    offset: the camera's dark counts, in the file's unit, which are subtracted first.
+    order: total degree of the polynomial that describes the background.
+    """
+
+    flatten: bool | None = None
+    scale: float | str | None = None
+    offset: float = 0.0
+    order: int = 2
+
+    def flattens(self, stack: Stack) -> bool:
+        """Whether this stack is flattened."""
+        return stack.is_integer if self.flatten is None else self.flatten
+
+    def scale_of(self, stack: Stack) -> float | Literal["background"]:
+        """The scale of this stack. Raises StackError for a scale that is neither above 0 nor "background"."""
+        if self.scale is None:
+            return "background" if stack.is_integer else 1.0
+        if self.scale == "background":
+            return "background"
+        if isinstance(self.scale, str):
+            raise StackError(f"{stack.source}: scale {self.scale!r} must be a number above 0 or 'background'")
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise StackError(f"{stack.source}: scale {self.scale} must be above 0")
+        return float(self.scale)
 
 
 @dataclass(frozen=True)
 class PrismReport:
-    """What was found in the images of one prism, and done to them.
+    """What was found in the images of one prism, and how they were changed.
 
-    bias: rad, None for bright field. background: mean level of the empty field in the file's unit,
-    offset removed. scale: the file's unit per empty bright field, by which the images were divided.
-    unevenness: peak to peak of the background that was flattened, relative to its mean (0 where nothing
-    was). noise: its standard deviation in units of the empty bright field, None for images too small to
-    tell.
+    bias: rad; None for bright field.
+    background: mean of the background in the file's unit, offset removed.
+    scale: the file's unit per empty bright field; the images were divided by it.
+    unevenness: of the background that was flattened, peak to peak, relative to its mean; 0 where none was flattened.
+    noise: standard deviation of the noise, relative to the empty bright field; None for images of less than 3 × 3
+        pixels, which are too small to tell.
     """
 
     bias: float | None
@@ -44,8 +106,10 @@ class PrismReport:
 class Measured:
     """A measured stack in the model's unit.
 
-    data: (prism, focus, y, x), float32, relative to the empty bright field. focus: µm.
-    pixel_size: (y, x) in µm. prisms: one report each.
+    data: (prism, focus, y, x), float32, relative to the empty bright field.
+    focus: one per plane, µm.
+    pixel_size: (y, x) in µm.
+    prisms: one report per prism.
     """
 
     data: Float[np.ndarray, "prism focus y x"]
@@ -54,88 +118,63 @@ class Measured:
     prisms: tuple[PrismReport, ...]
 
 
-def prepare(
-    stack: Stack,
-    biases: Sequence[float | None],
-    focus: Sequence[float],
-    pixel_size: tuple[float, float] | None = None,
-    *,
-    pixels: tuple[int, int] | None = None,
-    flatten: bool | None = None,
-    scale: float | str | None = None,
-    offset: float = 0.0,
-    order: int = 2,
-    empty: Sequence[float] | None = None,
-) -> Measured:
+def prepare(stack: Stack, expected: ExpectedStack, normalisation: Normalisation | None = None) -> Measured:
     """Check a stack against the acquisition and bring it to the model's unit, the empty bright field.
 
-    biases: one per prism, rad; None is bright field. focus: one per plane, µm. pixel_size: (y, x) in µm,
-    which wins over the file's; None takes the file's. pixels: (y, x) of the model, checked where given.
-    flatten: divide by the slow background, a polynomial surface of total degree `order`, one per prism; an
-    extinct prism's background (`empty` below 1e-3) is stray light and is replaced by `empty` instead.
-    scale: the file's unit per empty bright field of which the objective stops nothing, or "background" for
-    what takes the empty field to `empty`. offset: the camera's dark counts in the file's unit, subtracted
-    first. empty: the empty field's intensity behind each prism; None is that of ideal polarisers,
-    sin²(bias/2), and in bright field 1.
-    By default integers are flattened and scaled by their background; floats count as relative to the empty
-    bright field and are left alone.
-    Raises StackError where prisms, planes or pixels are not as many as said, no pixel size is known, an
-    extinct background should set the scale, or the background to divide by is not above 0.
-    Warns StackWarning where the file's sizes differ by more than 1 %, more than 1 % of the pixels are
-    saturated, or floats look like counts.
+    stack: as read from its file.
+    expected: what the acquisition says that the stack holds.
+    normalisation: how pixel values become intensities; None is `Normalisation()`, which flattens and scales integers
+        by their background and leaves floats as they are.
+
+    Raises StackError where the number of prisms, planes or pixels is not the expected one, no pixel size is known, the
+    scale should come from a background at extinction, or a background that divides the images is not above 0.
+    Warns StackWarning where the file's sizes differ from the expected ones by more than 1 %, more than 1 % of the
+    pixels are saturated, or floats look like counts.
     """
-    focus = tuple(float(z) for z in focus)
-    _check_options(stack, scale, offset, order)
-    _check_counts(stack, len(biases), len(focus), pixels)
-    pixel_size = _agreed_pixel_size(stack, pixel_size)
-    _compare_focus(stack, focus)
+    normalisation = normalisation or Normalisation()
+    _check_normalisation(stack, normalisation)
+    _check_counts(stack, expected)
+    pixel_size = _agreed_pixel_size(stack, expected.pixel_size)
+    _compare_focus(stack, expected.focus)
     _check_saturation(stack)
-    if flatten is None:
-        flatten = stack.is_integer
-    if scale is None:
-        scale = "background" if stack.is_integer else 1.0
-    levels = [_ideal_empty_field(bias) for bias in biases] if empty is None else empty
+    levels = expected.empty_levels
     prepared = [
-        _in_model_unit(images, bias, level, flatten, scale, offset, order, f"{stack.source}: prism {prism}")
-        for prism, (images, bias, level) in enumerate(zip(stack.data, biases, levels, strict=True))
+        _in_model_unit(stack, prism, bias, level, normalisation)
+        for prism, (bias, level) in enumerate(zip(expected.biases, levels, strict=True))
     ]
     reports = tuple(report for _, report in prepared)
     if not stack.is_integer:
         _check_brightness(stack, reports, levels)
-    return Measured(np.stack([images for images, _ in prepared]), focus, pixel_size, reports)
+    return Measured(np.stack([images for images, _ in prepared]), expected.focus, pixel_size, reports)
 
 
 def _in_model_unit(
-    images: Real[np.ndarray, "focus y x"],
-    bias: float | None,
-    expected: float,
-    flatten: bool,
-    scale: float | str,
-    offset: float,
-    order: int,
-    label: str,
+    stack: Stack, prism: int, bias: float | None, expected: float, normalisation: Normalisation
 ) -> tuple[Float[np.ndarray, "focus y x"], PrismReport]:
-    """One prism's images relative to the empty bright field, float32."""
-    extinct = expected < _EXTINCT
-    if scale == "background" and extinct:
+    """One prism's images relative to the empty bright field, float32. expected: the empty field's intensity."""
+    images, label = stack.data[prism], f"{stack.source}: prism {prism}"
+    flatten, scale, offset = normalisation.flattens(stack), normalisation.scale_of(stack), normalisation.offset
+    is_extinct = expected < _EXTINCT
+    if scale == "background" and is_extinct:
         named = "bright field" if bias is None else f"bias {bias:g} rad"
         raise StackError(
             f"{label} has {named}: its empty background {expected:.2g} is below {_EXTINCT:g}, "
             "too dark to scale by; give scale, the counts per empty bright field"
         )
-    # the lamp is steady while the specimen moves through focus: one surface serves all planes
-    surface = background_surface(np.median(images, axis=0) - offset, order if flatten else 0)
+    # the lamp does not change while the specimen moves through focus: one surface serves all planes
+    surface = background_surface(np.median(images, axis=0) - offset, normalisation.order if flatten else 0)
     level, lowest = float(surface.mean()), float(surface.min())
-    if lowest <= 0 and (scale == "background" or (flatten and not extinct)):
+    if lowest <= 0 and (scale == "background" or (flatten and not is_extinct)):
         raise StackError(
-            f"{label}'s background less the offset {offset:g} falls to {lowest:.4g}; it must stay above 0 to divide by"
+            f"{label}'s background minus the offset {offset:g} falls to {lowest:.4g}; "
+            "a background that divides the images must stay above 0"
         )
-    unit = level / expected if scale == "background" else float(scale)
+    unit = level / expected if scale == "background" else scale
     scaled = np.empty(images.shape, np.float32)
     for plane, image in enumerate(images):
         light = image.astype(np.float64) - offset
         if flatten:
-            light = light - surface + expected * unit if extinct else light * (level / surface)
+            light = light - surface + expected * unit if is_extinct else light * (level / surface)
         scaled[plane] = light / unit
     noise = noise_level(images)
     report = PrismReport(
@@ -149,28 +188,28 @@ def _in_model_unit(
 
 
 def _ideal_empty_field(bias: float | None) -> float:
-    """The intensity of an empty image, relative to the empty bright field, between ideal polarisers."""
+    """The intensity of an empty image between ideal polarisers, relative to the empty bright field."""
     return 1.0 if bias is None else math.sin(bias / 2) ** 2
 
 
-def _check_options(stack: Stack, scale: float | str | None, offset: float, order: int) -> None:
-    if isinstance(scale, str) and scale != "background":
-        raise StackError(f"{stack.source}: scale {scale!r} must be a number above 0 or 'background'")
-    if scale is not None and not isinstance(scale, str) and not (math.isfinite(scale) and scale > 0):
-        raise StackError(f"{stack.source}: scale {scale} must be above 0")
-    if not math.isfinite(offset):
-        raise StackError(f"{stack.source}: offset {offset} must be finite")
-    if order < 0:
-        raise StackError(f"{stack.source}: background order {order} must be at least 0")
+def _check_normalisation(stack: Stack, normalisation: Normalisation) -> None:
+    """Raise StackError for values that mean nothing."""
+    normalisation.scale_of(stack)
+    if not math.isfinite(normalisation.offset):
+        raise StackError(f"{stack.source}: offset {normalisation.offset} must be finite")
+    if normalisation.order < 0:
+        raise StackError(f"{stack.source}: background order {normalisation.order} must be at least 0")
 
 
-def _check_counts(stack: Stack, prisms: int, planes: int, pixels: tuple[int, int] | None) -> None:
-    held = stack.data.shape
+def _check_counts(stack: Stack, expected: ExpectedStack) -> None:
+    """Raise StackError where the prisms, planes or pixels are not as many as expected."""
+    held, prisms, planes = stack.data.shape, len(expected.biases), len(expected.focus)
     if held[:2] != (prisms, planes):
         raise StackError(
             f"{stack.source} holds {_counted(held[0], 'prism')} × {_counted(held[1], 'plane')}, "
             f"the acquisition says {prisms} × {planes}"
         )
+    pixels = expected.pixels
     if pixels is not None and held[2:] != tuple(pixels):
         raise StackError(
             f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), the volume {pixels[0]} × {pixels[1]}"
@@ -178,6 +217,7 @@ def _check_counts(stack: Stack, prisms: int, planes: int, pixels: tuple[int, int
 
 
 def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tuple[float, float]:
+    """The wanted pixel size (y, x) in µm, or the file's where none is wanted. Warns where the two differ."""
     found = stack.pixel_size
     if wanted is None:
         if found is None:
@@ -194,6 +234,7 @@ def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tupl
 
 
 def _compare_focus(stack: Stack, focus: tuple[float, ...]) -> None:
+    """Warn where the file's focus step differs from a step between planes."""
     found = stack.focus_step
     steps = [abs(b - a) for a, b in pairwise(focus)]
     if found is None or not any(_differ(found, step) for step in steps):
@@ -208,6 +249,7 @@ def _compare_focus(stack: Stack, focus: tuple[float, ...]) -> None:
 
 
 def _check_saturation(stack: Stack) -> None:
+    """Warn where too many pixels are saturated."""
     limit = stack.saturation
     if limit is None:
         return
@@ -222,6 +264,7 @@ def _check_saturation(stack: Stack) -> None:
 
 
 def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequence[float]) -> None:
+    """Warn where a background is too bright to be relative to the empty bright field."""
     for prism, (report, expected) in enumerate(zip(reports, levels, strict=True)):
         found = report.background / report.scale
         if found > _BRIGHT:

@@ -24,7 +24,7 @@ from recon.fit.descent import Step, descend
 from recon.fit.misfit import gaussian, spatial_variance
 from recon.fit.planned import announce_record, current
 from recon.fit.start import bytes_of_linear_start
-from recon.recording.preparation import Measured, prepare
+from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
 from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.run import checkpoint
@@ -79,18 +79,16 @@ def load_data(config: Config) -> Measured:
     if config.microscope.vectorial and config.reconstruction.start == "linear":
         raise ConfigError("reconstruction.start: 'linear' can't hold microscope.polarisation.pupil; use 'zero'")
     section = config.data
-    measured = prepare(
-        read_stack(section.path),
-        [None if prism is None else float(prism.bias) for prism in config.acquisition.prisms],
-        [float(focus) for focus in config.acquisition.focus],
-        config.volume.spacing[1:],
+    stack = read_stack(section.path)
+    expected = ExpectedStack(
+        biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
+        focus=tuple(float(focus) for focus in config.acquisition.focus),
+        pixel_size=config.volume.spacing[1:],
         pixels=config.volume.shape[1:],
-        flatten=section.flatten,
-        scale=section.scale,
-        offset=section.offset,
-        order=section.order,
-        empty=_empty_field(config),
+        empty=tuple(_empty_field(config)),
     )
+    normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
+    measured = prepare(stack, expected, normalisation)
     try:
         spatial_variance(torch.from_numpy(measured.data))
     except ValueError as error:

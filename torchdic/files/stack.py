@@ -1,77 +1,59 @@
-"""Recorded stacks and volumes of Δn, read and written by the suffix of their files."""
+"""Stacks and volumes of Δn, read and written in the format that the suffix of their file names.
 
+To add a format, write one file beside `torchdic.files.tiff` that defines a `Format`, and add it to `FORMATS`.
+"""
+
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
-from torchdic.files.tiff import _by, _check_finite, _check_structure, _read, _tifffile_logs_as_debug, _write_ome
+from torchdic.files.format import Format, Stack, shape_text
+from torchdic.files.tiff import TIFF
+from torchdic.files.whole import written_whole
 from torchdic.grid import Grid
 
+# The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
+FORMATS: list[Format] = [TIFF]
 
-@dataclass(frozen=True)
-class Stack:
-    """A recorded stack as its file holds it.
 
-    data: (prism, focus, y, x) in the stored dtype (integer or float), finite. pixel_size: (y, x) in µm, None
-    where the file doesn't say. focus_step: µm between planes, above 0, None where the file doesn't say. bits:
-    bits per pixel, which may be fewer than the dtype's (a 12-bit camera). names: of the prisms, () where the
-    file has none. source: the file, for messages. Raises StackError where data is not 4-D.
-    """
-
-    data: Shaped[np.ndarray, "prism focus y x"]
-    pixel_size: tuple[float, float] | None = None
-    focus_step: float | None = None
-    bits: int | None = None
-    names: tuple[str, ...] = ()
-    source: str = "stack"
-
-    def __post_init__(self) -> None:
-        if self.data.ndim != 4:
-            raise StackError(f"{self.source}: data has {self.data.ndim} axes, a stack has 4 (prism, focus, y, x)")
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether the pixels are counts of a camera (float ones are relative to the empty bright field)."""
-        return self.data.dtype.kind in "iu"
-
-    @property
-    def saturation(self) -> int | None:
-        """The largest value that an integer pixel can hold; None for float."""
-        if not self.is_integer:
-            return None
-        limit = int(np.iinfo(self.data.dtype).max)
-        return min(limit, 2**self.bits - 1) if self.bits and self.data.dtype.kind == "u" else limit
+def format_of(path: str | os.PathLike[str]) -> Format:
+    """The format of a file, by the suffix of its name; TIFF for a suffix that no format has."""
+    name = Path(path).name.lower()
+    return next((known for known in FORMATS if name.endswith(known.suffixes)), TIFF)
 
 
 def read_stack(path: str | os.PathLike[str]) -> Stack:
-    """Read a stack of greyscale images; its axes and sizes come from the file.
+    """Read a stack of greyscale images. Its axes and sizes come from the file.
 
-    OME-TIFF and ImageJ TIFF: the C axis is the prism, Z the focus. Plain TIFF: 2-D is one plane, 3-D is
-    (focus, y, x), 4-D is (prism, focus, y, x). Compressed files too. Sizes come from OME-XML or, in an ImageJ
-    TIFF, from the resolution, unit and spacing; the resolution of any other TIFF is a printer's and is left
-    aside. Raises StackError for a file that is missing, no TIFF, truncated, empty, coloured, of more
-    dimensions or of another dtype than integer and float, or with pixels that are not finite. Warns
-    StackWarning of a unit that is no length.
+    path: a file in one of `FORMATS`. Compressed files are read too.
+
+    In OME-TIFF and ImageJ TIFF the C axis is the prism and Z the focus. In plain TIFF, 2-D data is one plane, 3-D
+    is (focus, y, x) and 4-D is (prism, focus, y, x). Sizes come from OME-XML or, in an ImageJ TIFF, from the
+    resolution, the unit and the spacing. The resolution of any other TIFF is meant for printing and is ignored.
+
+    Raises StackError for a file that is missing, in no known format, truncated, empty or coloured, that has more
+    dimensions or a dtype other than integer and float, or that has pixels that are not finite.
+    Warns StackWarning of a size whose unit is no length.
     """
     path = Path(path)
-    _check_structure(path)
-    with _tifffile_logs_as_debug():
-        try:
-            stack = _read(path)
-        except (StackError, StackWarning):  # the latter where warnings are errors
-            raise
-        except Exception as error:
-            # bytes gone wrong raise anything, from struct.error to a codec's own error class
-            reason = (str(error).splitlines() or [""])[0]
-            raise StackError(f"{path}: cannot be read as TIFF: {type(error).__name__}: {reason}") from error
+    _check_openable(path)
+    known = format_of(path)
+    try:
+        stack = known.read(path)
+    except (StackError, StackWarning):  # the latter where warnings are errors
+        raise
+    except Exception as error:
+        # damaged bytes can raise anything, from struct.error to a codec's own error class
+        reason = (str(error).splitlines() or [""])[0]
+        raise StackError(f"{path}: cannot be read as {known.name}: {type(error).__name__}: {reason}") from error
     _check_finite(stack.data, path)
     return stack
 
@@ -85,27 +67,32 @@ def write_stack(
     names: Sequence[str] = (),
     compression: Literal["zlib", "lzw"] | None = None,
 ) -> None:
-    """Write a stack as OME-TIFF, whole or not at all.
+    """Write a stack, as OME-TIFF unless the suffix of `path` names another format. An error leaves no half a file.
 
-    data: (prism, focus, y, x), (focus, y, x) or (y, x), in its own dtype. pixel_size: (y, x) in µm.
-    focus_step: µm; None where it is unknown or unequal. names: one per prism. Raises StackError for other
-    shapes, a dtype that OME lacks, pixels that are not finite, and where it cannot write.
+    path: the file to write or replace.
+    data: (prism, focus, y, x), (focus, y, x) or (y, x); stored in its own dtype.
+    pixel_size: (y, x) in µm; None where it is unknown.
+    focus_step: distance between planes in µm; None where it is unknown or not the same for all planes.
+    names: one per prism, or none.
+    compression: None stores the pixels as they are.
+
+    Raises StackError for other shapes, a dtype that the format does not have, pixels that are not finite, sizes
+    that are not above 0, a format that is only read, and a place that cannot be written to.
     """
     path = Path(path)
-    array = data.detach().cpu().numpy() if isinstance(data, Tensor) else np.asarray(data)
+    array = _as_array(data)
     if array.ndim not in (2, 3, 4):
         raise StackError(
             f"{path}: data has {array.ndim} axes, a stack has (prism, focus, y, x), the first two optional"
         )
     array = array.reshape((1,) * (4 - array.ndim) + array.shape)
     if names and len(names) != len(array):
-        raise StackError(f"{path}: {len(names)} names for {len(array)} prisms; a name belongs to one prism")
-    dy, dx = pixel_size or (None, None)
-    _write_ome(path, array, (focus_step, dy, dx), tuple(names), compression)
+        raise StackError(f"{path}: {len(names)} names for {len(array)} prisms; each prism has one name")
+    _write(path, Stack(array, pixel_size, focus_step, names=tuple(names), source=str(path)), compression)
 
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float[Tensor, "z y x"], Grid]:
-    """Read a volume written by `write_volume`: (z, y, x) as float32, and its grid.
+    """Read a volume that `write_volume` wrote: Δn (z, y, x) as float32, and its grid in µm.
 
     Raises StackError as `read_stack` does, and for a file of more than one channel or without a voxel size.
     """
@@ -127,15 +114,75 @@ def write_volume(
     name: str = "delta n",
     compression: Literal["zlib", "lzw"] | None = None,
 ) -> None:
-    """Write a volume (z, y, x) as OME-TIFF float32, the grid's voxel size in µm, whole or not at all.
+    """Write a volume in float32, as OME-TIFF unless the suffix of `path` names another format.
 
-    Raises StackError where delta's shape is not the grid's, for voxels that are not finite, and where it
-    cannot write.
+    path: the file to write or replace. An error leaves no half a file.
+    delta: (z, y, x), real.
+    grid: of delta's shape; its spacing becomes the voxel size in µm.
+    name: of the file's one channel.
+    compression: None stores the voxels as they are.
+
+    Raises StackError where delta's shape is not the grid's, for voxels that are not finite, a format that is only
+    read, and a place that cannot be written to.
     """
     path = Path(path)
-    array = delta.detach().cpu().numpy() if isinstance(delta, Tensor) else np.asarray(delta)
+    array = _as_array(delta)
     if array.shape != grid.shape:
-        raise StackError(f"{path}: the volume has {_by(array.shape)} voxels, its grid {_by(grid.shape)}")
+        raise StackError(f"{path}: the volume has {shape_text(array.shape)} voxels, its grid {shape_text(grid.shape)}")
     if array.dtype.kind not in "iuf":
-        raise StackError(f"{path}: voxels are {array.dtype}, a volume is real")
-    _write_ome(path, array[None].astype(np.float32), grid.spacing, (name,), compression)
+        raise StackError(f"{path}: voxels are {array.dtype}, a volume holds real numbers")
+    voxels = array[None].astype(np.float32)
+    _write(path, Stack(voxels, grid.spacing[1:], grid.spacing[0], names=(name,), source=str(path)), compression)
+
+
+def _as_array(data: np.ndarray | Tensor) -> np.ndarray:
+    return data.detach().cpu().numpy() if isinstance(data, Tensor) else np.asarray(data)
+
+
+def _write(path: Path, stack: Stack, compression: str | None) -> None:
+    """Write a stack in its file's format beside its final place, and then move it there in one step."""
+    known = format_of(path)
+    if known.write is None:
+        raise StackError(f"{path}: {known.name} can be read but not written; choose a name that ends in .ome.tif")
+    _check_writable(path, stack, known.dtypes)
+    try:
+        with written_whole(path) as partial:
+            known.write(partial, stack, compression)
+    except OSError as error:
+        raise StackError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _check_openable(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+    except FileNotFoundError as error:
+        raise StackError(f"{path}: no such file") from error
+    except IsADirectoryError as error:
+        raise StackError(f"{path}: is a folder; a stack is one file") from error
+    except OSError as error:
+        raise StackError(f"{path}: cannot be opened: {error.strerror or error}") from error
+    if size == 0:
+        raise StackError(f"{path}: is empty, 0 bytes")
+
+
+def _check_writable(path: Path, stack: Stack, dtypes: tuple[str, ...]) -> None:
+    """Raise StackError for what no reader of stacks would accept."""
+    data = stack.data
+    if data.dtype.name not in dtypes:
+        raise StackError(f"{path}: pixels are {data.dtype}, the file can hold {', '.join(dtypes)}")
+    if data.size == 0:
+        raise StackError(f"{path}: would be empty, {shape_text(data.shape)}; a stack has at least one pixel")
+    _check_finite(data, path)
+    for axis, length in zip("zyx", (stack.focus_step, *(stack.pixel_size or ())), strict=False):
+        if length is not None and not (math.isfinite(length) and length > 0):
+            raise StackError(f"{path}: a size of {length} µm along {axis} must be above 0")
+
+
+def _check_finite(data: np.ndarray, path: Path) -> None:
+    if data.dtype.kind != "f":
+        return
+    bad = data.size - int(np.isfinite(data).sum())
+    if bad:
+        nan = int(np.isnan(data).sum())
+        raise StackError(f"{path}: {bad} of {data.size} pixels are not finite ({nan} NaN, {bad - nan} infinite)")

@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files that appear complete or not at all: an error or an interruption leaves no half a file."""
 
 import json
 import os
@@ -10,9 +10,10 @@ from pathlib import Path
 
 @contextmanager
 def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A path to write to, beside `path`, which takes the place of `path` when the block ends well.
+    """Give a temporary path beside `path` to write to, and move that file to `path` when the block ends.
 
-    If the block raises, `path` stays as it was. The partial file keeps the suffix, by which writers know their format.
+    If the block raises, the temporary file is removed and `path` stays as it was. The temporary file has the suffix of
+    `path`, because writers choose their format by it. Raises OSError where the folder cannot be written to.
     """
     path = Path(path)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
@@ -20,7 +21,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     partial = Path(name)
     try:
         yield partial
-        partial.chmod(0o666 & ~_umask())  # mkstemp's files are for their owner alone
+        partial.chmod(0o666 & ~_umask())  # mkstemp lets only the owner read its files
         with partial.open("rb") as file:
             os.fsync(file.fileno())
         partial.replace(path)
@@ -29,13 +30,13 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """A text file in UTF-8, whole or not at all."""
+    """Write a text file in UTF-8. An error leaves `path` as it was."""
     with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: str | os.PathLike[str], values: object) -> None:
-    """Values that JSON knows, two spaces a level, whole or not at all."""
+    """Write values as JSON, indented by two spaces. An error leaves `path` as it was."""
     write_text(path, json.dumps(values, indent=2) + "\n")
 
 

@@ -1,0 +1,75 @@
+"""A recorded stack in memory, and what a file format must offer to be read into one or written from one."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from torchdic.errors import StackError
+
+
+@dataclass(frozen=True)
+class Stack:
+    """A recorded stack of images, as its file holds it.
+
+    data: (prism, focus, y, x), integer or float as stored; `read_stack` gives finite values only.
+    pixel_size: (y, x) in µm; None where the file does not say.
+    focus_step: distance between planes in µm, above 0; None where the file does not say.
+    bits: bits per pixel, which may be fewer than the dtype has (a 12-bit camera); None where the file does not say.
+    names: one name per prism; () where the file has none.
+    source: the file's path, for messages.
+    Raises StackError where data does not have 4 axes.
+    """
+
+    data: Shaped[np.ndarray, "prism focus y x"]
+    pixel_size: tuple[float, float] | None = None
+    focus_step: float | None = None
+    bits: int | None = None
+    names: tuple[str, ...] = ()
+    source: str = "stack"
+
+    def __post_init__(self) -> None:
+        if self.data.ndim != 4:
+            raise StackError(f"{self.source}: data has {self.data.ndim} axes, a stack has 4 (prism, focus, y, x)")
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether the pixels are a camera's counts. Float pixels are relative to the empty bright field."""
+        return self.data.dtype.kind in "iu"
+
+    @property
+    def saturation(self) -> int | None:
+        """The largest value that an integer pixel can hold; None for float pixels."""
+        if not self.is_integer:
+            return None
+        limit = int(np.iinfo(self.data.dtype).max)
+        return min(limit, 2**self.bits - 1) if self.bits and self.data.dtype.kind == "u" else limit
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format: which files are in it, and how a stack is read from such a file or written to one.
+
+    name: as messages call it, such as "TIFF".
+    suffixes: the ends of its files' names, in lower case and with the dot.
+    read: takes the path of a file that can be opened and is not empty, and returns its stack. It raises StackError
+        with the path, the value and the rule for a file that is no stack. Any other exception is reported to the
+        user as a file that cannot be read in this format.
+    write: takes a path, a stack and the name of a compression (None for no compression). The stack's pixels are
+        finite and its sizes are above 0. The path lies beside the final one and is moved there afterwards, so an
+        interrupted write leaves no half a file. None for a format that is only read.
+    dtypes: the names of the dtypes that `write` can store.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    read: Callable[[Path], Stack]
+    write: Callable[[Path, Stack, str | None], None] | None = None
+    dtypes: tuple[str, ...] = ()
+
+
+def shape_text(shape: Sequence[int]) -> str:
+    """A shape as messages show it: 2 × 5 × 64 × 64."""
+    return " × ".join(str(n) for n in shape)
