@@ -14,7 +14,7 @@ KEPT_BY_MATRIX = 50
 def demand_of_imaging(
     grid: Grid, microscope: Microscope, acquisition: Acquisition, components: int = 1, *, learned: bool = False
 ) -> Demand:
-    """What `form_image` holds; measured by `python benchmarks/memory.py`.
+    """What `Imaging` holds; measured by `python benchmarks/memory.py`.
 
     components: of the spectrum. learned: whether the microscope or acquisition is, and not the specimen alone.
     """
@@ -31,10 +31,9 @@ def demand_of_imaging(
     lens = 0
     if objective is not None:
         lens = 2 * bool(objective.aberrations or objective.layer or objective.apodisation)
-    if microscope.vectorial:
+    if microscope.lenses is not None:
         assert polarisation is not None
-        assert polarisation.pupil is not None
-        pupil = polarisation.pupil
+        pupil = microscope.lenses
         states = [4 if prism is None else polarisation.states for prism in prisms]
         transfers = 2 * components * sum(states)
         factors = bool(pupil.retardance) + bool(pupil.diattenuation) + (pupil.depolarisation and components == 1)
@@ -48,7 +47,7 @@ def demand_of_imaging(
             shared=shared,
             once=last,
         )
-    leaks = polarisation is not None and not polarisation.ideal
+    leaks = microscope.polarisers is not None
     own = len(prisms) if found or not microscope.condenser_prism else 0
     kept = (2 * focus + lens + own + indexed) * window + (6 if leaks else 2) * images * field
     if found and leaks:

@@ -217,7 +217,7 @@ def _scene(
         crosses = wanted and any(part is not None and part.requires_grad for part in parts)
     else:
         wanted, crosses, own = gradient, gradient, max(own, int(gradient))
-    turned = microscope.turns and fidelity.propagation == "rays"
+    turned = microscope.turns_polarisation and fidelity.propagation == "rays"
     components = 2 if turned else 1
     if fidelity.propagation == "projection":
         crossing = demand_of_projection(volume, fidelity)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchdic.fidelity import STANDARD, Fidelity
 from torchdic.forward.foresee import Foreseen, allotted, allotted_to_fields, levels_of
 from torchdic.grid import Grid
-from torchdic.imaging.intensity import form_image
+from torchdic.imaging.intensity import Imaging
 from torchdic.imaging.passband import interpolate
 from torchdic.instrument.camera import Camera
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, check_sampling
@@ -64,25 +64,18 @@ def _image(
     """`image` of a padded volume in light of one wavelength."""
     momentum, weights = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
     fields = None if fidelity.propagation == "wave" else volume.sampled(fidelity.interpolation)
+    imaging = Imaging(
+        volume.grid, volume.background, plane, microscope, acquisition, fidelity.defocus, fidelity.band_limit
+    )
     # whether steps are computed again has been decided
     within = replace(fidelity, memory=1 if plan.slabs else sys.maxsize)
 
     def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
         spectrum = propagate(
-            volume, microscope.wavelength, momentum, plane, within, levels, fields, turned=microscope.turns
+            volume, microscope.wavelength, momentum, plane, within, levels, fields, turned=microscope.turns_polarisation
         )
-        return form_image(
-            spectrum,
-            volume.grid,
-            volume.background,
-            plane,
-            momentum,
-            weights,
-            microscope,
-            acquisition,
-            fidelity.defocus,
-            band_limit=fidelity.band_limit,
-        )
+        components = spectrum.reshape(len(momentum), -1, *spectrum.shape[-2:])
+        return imaging.intensity(components, momentum, weights)
 
     total = sum_over_sources(intensity, (momentum, weights), plan.sources)
     return _seen(total, volume.grid, fidelity.padding, microscope.camera)
@@ -157,9 +150,10 @@ def image_field(
     plan = allotted_to_fields(transmission, grid, n0, len(weights), microscope, acquisition, fidelity)
     spectra = to_spectrum(F.pad(transmission, (pad,) * 4, value=1.0))
 
+    imaging = Imaging(grid, n0, 0.0, microscope, acquisition, fidelity.defocus, fidelity.band_limit)
+
     def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-        scene = microscope, acquisition, fidelity.defocus
-        return form_image(spectra, grid, n0, 0.0, momentum, weights, *scene, band_limit=fidelity.band_limit)
+        return imaging.intensity(spectra[:, None], momentum, weights)
 
     own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
     total = sum_over_sources(intensity, (momentum, weights, own), plan.sources)

@@ -39,9 +39,11 @@ def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition
         inside = slices * SLICE[fidelity.interpolation] * (1 if volume.absorption is None else 2)
     else:
         inside = (fidelity.steps or slices) * BENT_SLICE
-    polarisation, states = microscope.polarisation, 0
-    if polarisation is not None and not polarisation.ideal:
-        states = polarisation.states if microscope.vectorial else 1
+    polarisers = microscope.polarisers
+    if microscope.lenses is not None:
+        states = 1 if polarisers is None else polarisers.states
+    else:
+        states = 0 if polarisers is None else 1
     images = len(acquisition.prisms) * len(acquisition.focus) * (IMAGE + POLARISED * states)
     sources = len(microscope.colours()) * directions(microscope, fidelity.sources)
     return sources * (SETUP + inside + images) * pixels * math.log2(max(pixels, 2))
