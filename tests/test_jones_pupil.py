@@ -25,8 +25,8 @@ from torchdic import (
     Volume,
     image,
     image_field,
-    jones,
 )
+from torchdic.instrument import jones
 from torchdic.instrument.polarised_lenses import diattenuating, product, retarding, turn
 from torchdic.linear import linear_image
 
@@ -274,7 +274,7 @@ def test_unit_pupil_is_no_pupil(declared, condenser_prism, axis):
 
 
 def test_empty_pupil_is_none(monkeypatch):
-    monkeypatch.setattr(Polarisation, "transfers", None)
+    monkeypatch.setattr(Polarisation, "pure_states", None)
     for pupil in (None, JonesPupil(), JonesPupil({}, {}, False)):
         assert torch.equal(seen(Polarisation(pupil=pupil)), seen())
         assert torch.equal(seen(Polarisation(**ERRORS, pupil=pupil)), seen(Polarisation(**ERRORS)))

@@ -25,7 +25,8 @@ from torchdic.plane_waves import to_field
 from torchdic.scalar import scalar
 
 # Shares of the intensity (state,) of an image's pure states, and each one's factors (state, source, component, y, x).
-States = tuple[Float[Tensor, " state"], Inexact[Tensor, "state source component y x"]]
+# How many states there are differs from image to image.
+States = tuple[Float[Tensor, " _"], Inexact[Tensor, "_ #source component #y #x"]]
 
 
 def polarised_images(
