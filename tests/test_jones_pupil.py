@@ -280,6 +280,29 @@ def test_empty_pupil_is_none(monkeypatch):
         assert torch.equal(seen(Polarisation(**ERRORS, pupil=pupil)), seen(Polarisation(**ERRORS)))
 
 
+@pytest.mark.parametrize(
+    ("polarisation", "polarisers", "lenses", "turns"),
+    [
+        (None, False, False, False),
+        (Polarisation(), False, False, False),
+        (Polarisation(pupil=JonesPupil({}, None, False)), False, False, False),
+        (Polarisation(analyser_error=0.0), True, False, False),
+        (Polarisation(0.0, pupil=JonesPupil()), True, False, False),
+        (Polarisation(pupil=JonesPupil(STRAIN)), False, True, False),
+        (Polarisation(pupil=JonesPupil(depolarisation=True)), False, True, True),
+        (Polarisation(retardance_error=0.1, pupil=JonesPupil(STRAIN, LOSSES, True)), True, True, True),
+    ],
+)
+def test_microscope_names_what_acts_on_polarisation_and_none_where_nothing_does(
+    polarisation, polarisers, lenses, turns
+):
+    """Zero is a value: what is declared as 0 is there."""
+    scope = replace(SCOPE, polarisation=polarisation)
+    assert scope.polarisers is (polarisation if polarisers else None)
+    assert scope.lenses is (polarisation.pupil if lenses else None)
+    assert scope.turns_polarisation is turns
+
+
 def test_direct_light_is_dark_at_extinction_at_any_aperture(propagation):
     """p = p0: the lenses undo each other's turn, so an empty field of oblique light stays at sin²(bias/2)."""
     grid = Grid((3, 12, 15), (0.5, 0.12, 0.11))

@@ -34,8 +34,10 @@ def polarised_images(
 ) -> list[Float[Tensor, "row column"]]:
     """The images of each focus and prism.
 
-    focused: the spectrum (source, component, y, x) at each focus. transfers: of each prism, from `state_transfers`.
-    weights: the sources' shares of the light. shape: of the images (y, x).
+    focused: the spectrum (source, component, y, x) at each focus.
+    transfers: of each prism, from `state_transfers`.
+    weights: the sources' shares of the light.
+    shape: of the images (y, x).
     """
     images = []
     for wave in focused:
@@ -54,8 +56,9 @@ def state_transfers(
 ) -> list[States]:
     """For each prism the shares of the light's pure states, and the factors on the spectrum for each state.
 
-    passes: which waves pass the pupil. components: of the spectrum. One: it is a scalar amplitude. Two: along +x and
-    +y, for light that comes in along +x; the specimen then turns all polarisations alike.
+    passes: which waves pass the pupil.
+    components: how many the spectrum has. With one it is a scalar amplitude. Two are along +x and +y, for light that
+    comes in polarised along +x; the specimen turns all polarisations by the same angle.
     """
     frequencies = waves.field_frequencies()
     matrix = _lenses(waves, frequencies, passes, microscope, components)
@@ -95,12 +98,14 @@ def _between_polarisers(
     kind, device = half.dtype, half.device
     shares = (analyser.shares[:, None] * light.shares).flatten().to(device, kind)
     cos, sin = prism.polarised_along(waves.momentum)
+    # in front of the lenses: the condenser's prism, then the laboratory's frame
     one, two = light.vectors.to(device, kind.to_complex())[:, None].unbind(-1)
     if tilt is not None:
         condenser = torch.polar(torch.ones_like(tilt), -tilt)
         one, two = one * condenser, two * condenser.conj()
     laboratory = torch.stack((cos * one - sin * two, sin * one + cos * two), -1)
     x, y = _behind(lenses, laboratory, components).unbind(3)
+    # behind them: the objective's prism in its own frame, then the analyser
     beam = torch.polar(torch.ones_like(half), half + scalar(bias, half) / 2)[:, None]
     beams = beam * (cos * x + sin * y), beam.conj() * (cos * y - sin * x)
     first, second = analyser.vectors.to(device, kind)[:, :, None, None, None, None, None].unbind(1)

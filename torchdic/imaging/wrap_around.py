@@ -109,7 +109,7 @@ def check_wrap_around(
     beyond = spread.beyond(distance)
     if beyond is None:
         return
-    light = weights[:, None, None] * torch.view_as_real(spectrum).square().sum(-1).sum(1)
+    light = weights[:, None, None] * torch.view_as_real(spectrum).square().sum((1, -1))
     total = float(light.sum())
     light, beyond = torch.where(spread.direct, 0, light).flatten(), beyond.flatten()
     part = float(light[beyond > 0].sum()) / total if total > 0 else 0.0

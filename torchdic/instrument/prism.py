@@ -121,7 +121,7 @@ class Prism:
     def transfer(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
         """sin(π f·s + bias/2): interference of the two beams behind a crossed analyser, without a constant factor i.
 
-        frequencies: in 1/µm; the envelope's f if a condenser prism cancels the tilt's phase, or else the field's f + f_s.
+        frequencies: in 1/µm; the envelope's f if a condenser prism cancels the tilt's phase, else the field's f + f_s.
         """
         return torch.sin(self._half_difference(frequencies))
 
