@@ -25,7 +25,7 @@ from comparison import header, row
 from stored import PADDING, Scene, sharp_bead, smooth_ball
 from torchdic import Fidelity, Grid, Volume, image, image_field
 from torchdic.fidelity import AberrationMethod
-from torchdic.imaging.intensity import form_image
+from torchdic.imaging.intensity import Imaging
 from torchdic.imaging.passband import interpolate
 from torchdic.object_aberration.levels import levels
 from torchdic.object_aberration.wavefront import effective_defocus
@@ -119,7 +119,8 @@ def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMet
         difference, _ = axial_difference(volume.grid, microscope.wavelength, n0, momentum)
         at_plane = field(volume, microscope.wavelength, momentum, plane, rays)
         spectrum = levels(defocus, rate).spread(at_plane, microscope.wavelength, difference)
-        images = form_image(spectrum, volume.grid, n0, plane, momentum, weights, microscope, scene.acquisition)
+        imaging = Imaging(volume.grid, n0, plane, microscope, scene.acquisition)
+        images = imaging.intensity(spectrum[:, None], momentum, weights)
     return scene.errors(interpolate(images, (volume.grid.shape[1], volume.grid.shape[2])))
 
 

@@ -24,9 +24,10 @@ from torchdic import (
     Volume,
     foreseen,
     image,
-    imaging,
 )
+from torchdic.imaging import polarised
 from torchdic.object_aberration.levels import object_levels
+from torchdic.propagation import bent_rays
 from torchdic.rays.caustics import Tubes
 from torchdic.specimen.interpolation import SliceSampler
 
@@ -338,7 +339,7 @@ def test_paraxial_defocus_costs_no_transform(delta, counted, propagation):
     assert float((exact() - paraxial()).abs().max()) > 1e-4
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 def test_band_limit_costs_no_transform(delta, counted, propagation):
     far = Acquisition(ACQUISITION.prisms, [60.0, -9.0])
     periodic, limited = (taking(delta, SCOPE, far, propagation, band_limit=limit) for limit in (False, True))
@@ -421,7 +422,7 @@ def test_pupil_of_matrices_takes_a_field_for_each_state_of_the_light(
 
 def test_matrices_are_made_once_for_all_prisms_and_focus_planes(delta, monkeypatch):
     calls = Counter()
-    for owner, name in ((JonesPupil, "lenses"), (imaging, "turn")):
+    for owner, name in ((JonesPupil, "lenses"), (polarised, "turn")):
         plain = getattr(owner, name)
         monkeypatch.setattr(owner, name, lambda *a, plain=plain, name=name: calls.update([name]) or plain(*a))
     pupil = JonesPupil(STRAIN, depolarisation=True)

@@ -21,8 +21,8 @@ from torchdic import (
     Volume,
     image,
     image_field,
-    jones,
 )
+from torchdic.instrument import jones
 from torchdic.linear import linear_image
 
 F64 = torch.float64

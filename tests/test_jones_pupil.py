@@ -25,8 +25,8 @@ from torchdic import (
     Volume,
     image,
     image_field,
-    jones,
 )
+from torchdic.instrument import jones
 from torchdic.instrument.polarised_lenses import diattenuating, product, retarding, turn
 from torchdic.linear import linear_image
 
@@ -274,10 +274,33 @@ def test_unit_pupil_is_no_pupil(declared, condenser_prism, axis):
 
 
 def test_empty_pupil_is_none(monkeypatch):
-    monkeypatch.setattr(Polarisation, "transfers", None)
+    monkeypatch.setattr(Polarisation, "pure_states", None)
     for pupil in (None, JonesPupil(), JonesPupil({}, {}, False)):
         assert torch.equal(seen(Polarisation(pupil=pupil)), seen())
         assert torch.equal(seen(Polarisation(**ERRORS, pupil=pupil)), seen(Polarisation(**ERRORS)))
+
+
+@pytest.mark.parametrize(
+    ("polarisation", "polarisers", "lenses", "turns"),
+    [
+        (None, False, False, False),
+        (Polarisation(), False, False, False),
+        (Polarisation(pupil=JonesPupil({}, None, False)), False, False, False),
+        (Polarisation(analyser_error=0.0), True, False, False),
+        (Polarisation(0.0, pupil=JonesPupil()), True, False, False),
+        (Polarisation(pupil=JonesPupil(STRAIN)), False, True, False),
+        (Polarisation(pupil=JonesPupil(depolarisation=True)), False, True, True),
+        (Polarisation(retardance_error=0.1, pupil=JonesPupil(STRAIN, LOSSES, True)), True, True, True),
+    ],
+)
+def test_microscope_names_what_acts_on_polarisation_and_none_where_nothing_does(
+    polarisation, polarisers, lenses, turns
+):
+    """Zero is a value: what is declared as 0 is there."""
+    scope = replace(SCOPE, polarisation=polarisation)
+    assert scope.polarisers is (polarisation if polarisers else None)
+    assert scope.lenses is (polarisation.pupil if lenses else None)
+    assert scope.turns_polarisation is turns
 
 
 def test_direct_light_is_dark_at_extinction_at_any_aperture(propagation):

@@ -21,6 +21,7 @@ from torchdic import (
     image_field,
     thin_lens,
 )
+from torchdic.imaging.pupil import Pupil, Waves
 from torchdic.instrument.objective import apodise
 from torchdic.instrument.zernike import zernike
 from torchdic.linear import linear_image
@@ -241,6 +242,31 @@ def test_compensating_layers_cancel():
     there, back = Layer(12.5, 1.45, 1.515), Layer(12.5, 1.515, 1.45)
     torch.testing.assert_close(there.phase(momentum, 0.5), -back.phase(momentum, 0.5))
     torch.testing.assert_close(there.phase(momentum, 0.5), -Layer(-12.5, 1.45, 1.515).phase(momentum, 0.5))
+
+
+@pytest.mark.parametrize("objective", [None, Objective(0.75), Objective(1.3, {4: 0.3}, "aplanatic")])
+def test_pupil_passes_the_waves_that_propagate_within_the_aperture(objective):
+    """Whether f is the whole array's or a few frequencies of each source; what is stopped is exactly 0."""
+    grid, n0 = Grid((1, 10, 13), (1.0, 0.13, 0.15)), torch.tensor(1.36, dtype=torch.float64)
+    every = grid.frequencies(dtype=torch.float64)
+    for frequencies in (every, every[:, 2:5, 1:8].expand(len(POINTS), -1, -1, -1)):
+        waves = Waves(grid, 0.546, n0, POINTS, frequencies)
+        momentum = POINTS[:, :, None, None] + 0.546 * frequencies
+        length = momentum.norm(dim=1)
+        pupil = Pupil.of(objective, waves)
+        passes = length < 1.36 if objective is None else length <= objective.na
+        assert torch.equal(pupil.passes, passes)
+        assert 0 < int(passes.sum()) < passes.numel() or frequencies is not every
+        factor = None if objective is None else objective.transfer(momentum, POINTS, 0.546, n0)
+        spectrum = torch.ones(len(POINTS), 2, *frequencies.shape[-2:], dtype=torch.complex128)
+        behind = spectrum if factor is None else factor[:, None] * spectrum
+        assert torch.equal(pupil.through(spectrum), torch.where(passes[:, None], behind, 0))
+        root = torch.where(length < 1.36, 1.36**2 - length**2, 0).sqrt()
+        torch.testing.assert_close(pupil.pz, root)
+        difference = root - (1.36**2 - POINTS.square().sum(1)).sqrt()[:, None, None]
+        torch.testing.assert_close(pupil.difference[passes], difference[passes], rtol=0, atol=1e-14)
+        paraxial = -(length**2 - POINTS.square().sum(1)[:, None, None]) / (2 * 1.36)
+        torch.testing.assert_close(Pupil.of(objective, waves, "paraxial").difference, paraxial, rtol=0, atol=1e-13)
 
 
 def test_weak_specimen_is_seen_through_the_same_pupil(smooth_field):

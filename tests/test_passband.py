@@ -19,7 +19,6 @@ from torchdic import (
     Volume,
     image,
     image_field,
-    imaging,
 )
 from torchdic.imaging.passband import Passband, interpolate
 
@@ -85,22 +84,20 @@ def assert_same(both):
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-12 * max(1.0, float(expected.abs().max())))
 
 
-@pytest.mark.filterwarnings(
-    "ignore::torchdic.wrap_around.WrapAroundWarning", "ignore::torchdic.instrument.SamplingWarning"
-)
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning", "ignore::torchdic.errors.SamplingWarning")
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 def test_images_and_gradients_are_those_of_the_whole_array(whole, grid):
     assert_same(whole(taken(grid, MICROSCOPES["plain"])))
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 @pytest.mark.parametrize("microscope", MICROSCOPES.values(), ids=MICROSCOPES.keys())
 @pytest.mark.parametrize("grid", [GRIDS["even"], GRIDS["prime"]], ids=["even", "prime"])
 def test_every_pupil_and_pair_of_beams_is_held(whole, grid, microscope, propagation):
     assert_same(whole(taken(grid, microscope, fidelity=Fidelity(propagation))))
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 def test_paraxial_defocus_is_held(whole):
     assert_same(whole(taken(GRIDS["odd"], MICROSCOPES["plain"], fidelity=Fidelity("projection", defocus="paraxial"))))
 
@@ -167,7 +164,7 @@ def test_fields_are_as_small_as_their_intensities_allow(monkeypatch):
 
 
 def test_no_objective_takes_no_window(monkeypatch):
-    monkeypatch.setattr(imaging.Passband, "around", lambda *_: pytest.fail("nothing bounds the frequencies"))
+    monkeypatch.setattr(Passband, "around", lambda *_: pytest.fail("nothing bounds the frequencies"))
     grid = GRIDS["even"]
     volume = Volume(grid, torch.zeros(grid.shape, dtype=torch.float64), N0)
     image(volume, Microscope(WAVELENGTH, None, CONDENSER), Acquisition(), Fidelity("projection"))

@@ -55,7 +55,7 @@ def test_empty_field_wraps_nothing(propagation):
         image(volume, MICROSCOPE, Acquisition(focus=[500.0]), Fidelity(propagation))
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 @pytest.mark.parametrize(("focus", "gain"), [(16.0, 1.3), (-40.0, 2.5), (80.0, 3.0)])
 def test_band_limit_is_nearer_to_the_wide_array_and_the_more_so_the_farther(propagation, focus, gain):
     """A specimen alone: its light that left belongs nowhere in the array, against one wide enough to hold it all."""
@@ -78,7 +78,7 @@ def test_band_limit_leaves_an_empty_field_as_it_is(propagation):
     torch.testing.assert_close(images, expected[:, None, None, None].expand_as(images), rtol=0, atol=1e-14)
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 def test_periodic_specimen_repeats_itself_at_talbots_distance_unless_it_is_limited():
     """A grating's image comes back at λ/(n0 − √(n0² − (λ/period)²)): light that wraps around is its neighbours'."""
     grid = Grid((1, 1, 24), (0.4, 0.25, 0.25))

@@ -9,7 +9,6 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
-import torchdic.propagation.table  # first: a fidelity names one of the propagations in the table
 from torchdic.errors import SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.fidelity import Fidelity
 from torchdic.forward.foresee import foreseen

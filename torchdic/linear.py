@@ -1,16 +1,17 @@
-"""Earlier models of DIC as limits of this one: Galbraith's thin phase object, Holmes and Levy's linear transfer.
+"""Two earlier models of DIC, limits of this one: Galbraith's thin phase object, and Holmes and Levy's linear transfer.
 
-Linear transfer. A weak slice of index Δn and thickness dz at depth z scatters, by the first Born approximation and
-Weyl's expansion, the wave of a source p0 into
+Linear transfer. Let a weak slice of index Δn and thickness dz lie at depth z. By the first Born approximation and
+Weyl's expansion it scatters the wave of a source p0 into
     U1(f) = i·k0·dz·(n0/p_z)·F{Δn}(f)·exp(i k0 (z_f − z)(p_z − p_z0)),    p_z at the field's frequency f + f_s,
-referred to the focus z_f: the wave rung's own response, of either order. The unscattered light is the pupil at f_s
-times the prism at f = 0. To first order in Δn the intensity changes by both cross terms,
+referred to the focus z_f. To first order in Δn, split-step propagation gives the same, in either of its orders. The
+unscattered light is the pupil at f_s times the prism at f = 0. To first order in Δn the intensity changes by the sum of
+both cross terms of scattered and unscattered light,
     F{δI}(f) = Σ_z T(f; z_f − z)·F{Δn(z)}(f),
     T = conj(D(0))·D(f)·M(f) + D(0)·conj(D(−f)·M(−f)),
     M(f; ζ) = Σ_s w_s·conj(P(f_s))·P(f + f_s)·i·k0·dz·(n0/p_z)·exp(i k0 ζ (p_z − p_z0)).
-The prism is a factor: with no bias D(0) = 0, and DIC has no linear response at all. As a function of the axial
-frequency, M of a single source is its Ewald sphere, a delta function at (p_z − p_z0)/λ; T is kept as a function of
-depth, where it is smooth.
+The prism is a factor. Without bias D(0) = 0, so DIC has no linear response at all. As a function of axial frequency, M
+of a single source is its Ewald sphere, a delta function at (p_z − p_z0)/λ; as a function of depth it is smooth, so T is
+computed for depths.
 
 T. J. Holmes and W. J. Levy, Appl. Opt. 26, 3929 (1987); M. Born and E. Wolf, Principles of Optics, 13.1;
 N. Streibl, J. Opt. Soc. Am. A 2, 121 (1985) for the bright field.
@@ -25,10 +26,11 @@ from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
+from torchdic.imaging.pupil import Pupil, Waves
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures
 from torchdic.instrument.prism import Prism
 from torchdic.memory.batches import sum_over_sources
-from torchdic.plane_waves import axial_difference, exp_i, to_field, to_spectrum
+from torchdic.plane_waves import exp_i, to_field, to_spectrum
 from torchdic.propagation.presets import STANDARD
 from torchdic.propagation.split_step import LOWEST_PZ
 from torchdic.scalar import number, scalar
@@ -38,9 +40,14 @@ from torchdic.specimen.volume import Volume
 def two_beam_image(phase: Float[Tensor, "y x"], grid: Grid, prism: Prism) -> Float[Tensor, "y x"]:
     """Galbraith's image of a thin phase object: sin²(½[φ(x + s/2) − φ(x − s/2)] + bias/2).
 
-    Axial light, no pupil, the object in focus: two beams of geometrical optics interfere. phase: φ in rad (y, x) on the
-    grid's pixels, periodic; it is shifted by Fourier interpolation, exactly so where half the shear is a whole
-    number of pixels. Relative to the empty bright field. Raises ValueError where the shape isn't the grid's.
+    Two beams of geometrical optics interfere: axial light, no pupil, the object in focus. Fourier interpolation shifts
+    the phase, exactly where half the shear is a whole number of pixels. Relative to the empty bright field.
+
+    phase: φ in rad (y, x) on the grid's pixels, periodic.
+    grid: its number of slices plays no part.
+    prism: shear and bias.
+
+    Raises ValueError where the shape isn't the grid's.
 
     W. Galbraith and G. B. David, J. Microsc. 108, 147 (1976).
     """
@@ -68,10 +75,18 @@ def transfer_function(
 ) -> Complex[Tensor, "z y x"]:
     """The linear transfer T(f; z_f − z) of each slice z, shape (z, y, x), in the order of the FFT along (y, x).
 
-    The image of a weak specimen is background + Σ_z F⁻¹[T·F{Δn(z)}]; T is per unit of Δn, or of κ with `absorption`.
-    prism: None is bright field. focus: z_f in µm. Of fidelity only `sources` and `steps` count. Differentiable in the
-    prism, the focus, the background and the aberrations. Raises ValueError as `image` does, for a pupil of Jones
-    matrices, and for a prism where the microscope has no condenser prism: its factor then differs between sources.
+    The image of a weak specimen is the empty field's + Σ_z F⁻¹[T·F{Δn(z)}].
+
+    prism: None is bright field.
+    background: refractive index of the medium.
+    fidelity: only `sources`, `steps` and `memory` matter.
+    focus: depth z_f in µm.
+    absorption: whether T is per unit of κ instead of Δn.
+    dtype, device: of the real numbers; those of `background` where it is a tensor and none are given.
+
+    Differentiable in the prism, the focus, the background and the aberrations. Raises ValueError as `image` does, where
+    lenses act on polarisation, and for a prism where the microscope has no condenser prism: the prism's factor would
+    then differ between sources.
     """
     acquisition = Acquisition((prism,), (focus,))
     return transfer_functions(
@@ -90,10 +105,9 @@ def transfer_functions(
     dtype: torch.dtype | None = None,
     device: torch.device | str | None = None,
 ) -> Complex[Tensor, "prism focus z y x"]:
-    """`transfer_function` of every prism and focus, shape (prism, focus, z, y, x).
+    """The linear transfer of every prism and focus; arguments and errors as of `transfer_function`.
 
-    The sources are summed once for all prisms. dtype and device: of the real numbers; background's where it is a
-    tensor and none is given.
+    The sources are summed once for all prisms.
     """
     n0, dtype, device = _medium(background, dtype, device)
     M, _ = _kernel(grid, microscope, acquisition, n0, fidelity, dtype, device)
@@ -112,9 +126,10 @@ def transfer_functions(
 def linear_image(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity = STANDARD
 ) -> Float[Tensor, "prism focus y x"]:
-    """The image of a specimen to first order in Δn and κ; what `image` by the wave rung tends to for a weak one.
+    """The image of a specimen to first order in Δn and κ, relative to the empty bright field.
 
-    Relative to the empty bright field. Arguments as of `image`, errors as of `transfer_function`.
+    The weaker the specimen, the better it agrees with `image` by split-step propagation. Arguments as of `image`,
+    errors as of `transfer_function`.
     """
     pad = fidelity.padding
     grid = volume.grid.widened(pad, pad)
@@ -128,26 +143,26 @@ def linear_image(
     images = []
     for prism in acquisition.prisms:
         D0D = torch.ones_like(frequencies[0]) if prism is None else _two_beams(prism, microscope, frequencies)
-        # the two cross terms are conjugate of each other in space
+        # in space the two cross terms are complex conjugates of each other
         images.append(D0D[0, 0].real * through + 2 * to_field(D0D * wave).real)
     return torch.stack(images)[..., pad : grid.shape[1] - pad, pad : grid.shape[2] - pad]
 
 
 def _two_beams(prism: Prism, microscope: Microscope, frequencies: Float[Tensor, "2 y x"]) -> Tensor:
-    """The prism's factor conj(D(0))·D(f) of the linear transfer, (y, x); complex where the polarisation isn't ideal.
+    """The prism's factor conj(D(0))·D(f) of the linear transfer, (y, x); complex where the polarisers aren't ideal.
 
-    The polarisation's quadratic form a|S|² + b|C|² + Re(c·C·S*) is linear in the scattered light: S and C are the field
-    times real factors, so the factor is a·S(0)S(f) + b·C(0)C(f) + ½[c·S(0)C(f) + c*·C(0)S(f)].
+    Of the polarisers' intensity a|S|² + b|C|² + Re(c·C·S*) only the part that is linear in the scattered light counts.
+    S and C are the field times real factors, so the factor is a·S(0)S(f) + b·C(0)C(f) + ½[c·S(0)C(f) + c*·C(0)S(f)].
     """
     if not microscope.condenser_prism:
         raise ValueError(
             "the linear transfer takes a prism's factor out of the sum over sources: it needs a condenser prism"
         )
-    S, polarisation = prism.transfer(frequencies), microscope.polarisation
-    if polarisation is None or polarisation.ideal:
+    S, polarisers = prism.transfer(frequencies), microscope.polarisers
+    if polarisers is None:
         return S[0, 0] * S
     C = prism.parallel(frequencies)
-    a, b, c = (v.to(S.device) for v in polarisation.form(prism.bias))
+    a, b, c = (v.to(S.device) for v in polarisers.form(prism.bias))
     factor = a * S[0, 0] * S + b * C[0, 0] * C + (c * S[0, 0] * C + c.conj() * C[0, 0] * S) / 2
     return factor.to(S.dtype.to_complex())
 
@@ -163,37 +178,46 @@ def _kernel(
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
     check_apertures(microscope, number(background))
-    if microscope.vectorial:
+    if microscope.lenses is not None:
         raise ValueError(
             "the linear transfer takes a prism's factor out of the sum over waves: it can't hold a polarisation pupil"
         )
-    if microscope.spectrum is not None:
-        colours = [
-            (share, *_kernel(grid, part, acquisition, background, fidelity, dtype, device))
-            for part, share in microscope.colours()
-        ]
-        kernels, shares_through = zip(*((share * M, share * passed) for share, M, passed in colours), strict=True)
-        return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
+    colours = [
+        (share, *_kernel_of_colour(grid, part, acquisition, background, fidelity, dtype, device))
+        for part, share in microscope.colours()
+    ]
+    if microscope.spectrum is None:
+        _, M, through = colours[0]
+        return M, through
+    kernels, shares_through = zip(*((share * M, share * passed) for share, M, passed in colours), strict=True)
+    return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
+
+
+def _kernel_of_colour(
+    grid: Grid,
+    microscope: Microscope,
+    acquisition: Acquisition,
+    background: Tensor,
+    fidelity: Fidelity,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
+    """`_kernel` in light of one wavelength."""
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
     depths, overlaps = _slabs(grid, fidelity, dtype, device)
     momentum, weights = microscope.sources(fidelity.sources, dtype=dtype, device=device)
     foci = torch.stack([scalar(z, momentum) for z in acquisition.focus])
 
     def contribution(momentum: Tensor, weights: Tensor) -> Tensor:
-        difference, pz = axial_difference(grid, microscope.wavelength, background, momentum)
-        passes = pz > 0
-        pupil = torch.where(passes, 1.0, 0.0).to(dtype)
-        if microscope.objective is not None:
-            waves = momentum[:, :, None, None] + microscope.wavelength * frequencies
-            pupil = pupil * microscope.objective.aperture(waves)
-            transfer = microscope.objective.transfer(waves, momentum, microscope.wavelength, background)
-            if transfer is not None:
-                pupil = pupil * transfer
-        # the unscattered wave, f = 0: sources that miss the pupil have no cross term
-        cross = weights[:, None, None] * pupil[:, :1, :1].conj() * pupil * (background / pz.clamp_min(LOWEST_PZ))
-        # exp(ik0(z_f − z)q) is a product: a matrix product over the sources sums them for all foci and slices
-        at_focus = exp_i(k0 * foci[:, None, None, None] * difference) * cross
-        at_slice = exp_i(-k0 * depths[:, None, None, None] * difference)
+        waves = Waves(grid, microscope.wavelength, background, momentum, frequencies)
+        pupil = Pupil.of(microscope.objective, waves)
+        passed = pupil.through(torch.ones_like(pupil.pz)[:, None]).squeeze(1)
+        # passed at f = 0 is the unscattered wave: a source that misses the pupil has no cross term
+        pz = pupil.pz.clamp_min(LOWEST_PZ)
+        cross = weights[:, None, None] * passed[:, :1, :1].conj() * passed * (background / pz)
+        # exp(i k0 (z_f − z) q) is a product, so that a matrix product sums the sources for all foci and slices at once
+        at_focus = exp_i(k0 * foci[:, None, None, None] * pupil.difference) * cross
+        at_slice = exp_i(-k0 * depths[:, None, None, None] * pupil.difference)
         if overlaps is None:
             at_slice = at_slice * grid.spacing[0]
         else:
@@ -205,7 +229,7 @@ def _kernel(
         through = (weights * microscope.objective.aperture(momentum[:, :, None, None])[:, 0, 0]).sum()
     planes = len(depths) + grid.shape[0] + len(foci)
     pixels = grid.shape[1] * grid.shape[2]
-    # complex planes and the phases that they are made of
+    # complex planes, and the phases from which they are made
     each = 4 * planes * pixels * momentum.element_size()
     M = sum_over_sources(contribution, (momentum, weights), max(1, fidelity.memory // each))
     return M, through
@@ -214,7 +238,10 @@ def _kernel(
 def _slabs(
     grid: Grid, fidelity: Fidelity, dtype: torch.dtype, device: torch.device
 ) -> tuple[Float[Tensor, " slab"], Float[Tensor, "slab z"] | None]:
-    """Depths of the wave's slabs in µm, and the length in µm of each that each slice fills; None: slabs are slices."""
+    """Depths in µm of split-step propagation's slabs, and the length in µm over which each overlaps each slice.
+
+    The lengths are None where slabs and slices are the same.
+    """
     nz, steps, extent = grid.shape[0], fidelity.steps or grid.shape[0], grid.extent[0]
     faces, borders = ((torch.arange(n + 1, dtype=torch.float64) / n - 0.5) * extent for n in (steps, nz))
     depths = ((faces[1:] + faces[:-1]) / 2).to(device, dtype)
@@ -225,13 +252,14 @@ def _slabs(
 
 
 def _reversed(spectrum: Tensor) -> Tensor:
-    """A spectrum (…, y, x) at −f: of a real image's, the conjugate."""
+    """A spectrum (…, y, x) at −f."""
     return spectrum.flip((-2, -1)).roll((1, 1), (-2, -1))
 
 
 def _medium(
     background: float | Tensor, dtype: torch.dtype | None, device: torch.device | str | None
 ) -> tuple[Tensor, torch.dtype, torch.device]:
+    """The background as a tensor, with its dtype and device."""
     given = background if isinstance(background, Tensor) else torch.tensor(background, dtype=dtype, device=device)
     n0 = given.to(dtype=dtype or given.dtype, device=device or given.device)
     return n0, n0.dtype, n0.device

@@ -76,7 +76,7 @@ def load_data(config: Config) -> Measured:
         raise ConfigError(
             "reconstruction.start: 'linear' needs a condenser prism, microscope.condenser_prism is false; use 'zero'"
         )
-    if config.microscope.vectorial and config.reconstruction.start == "linear":
+    if config.microscope.lenses is not None and config.reconstruction.start == "linear":
         raise ConfigError("reconstruction.start: 'linear' can't hold microscope.polarisation.pupil; use 'zero'")
     section = config.data
     stack = read_stack(section.path)

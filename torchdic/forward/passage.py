@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
-from torchdic.imaging.intensity import form_image
+from torchdic.imaging.intensity import Imaging
 from torchdic.imaging.passband import interpolate
 from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.memory.batches import sum_over_sources
@@ -44,7 +44,7 @@ class Passage:
         propagation = propagation_of(fidelity)
         plane = propagation.reference_plane(volume, fidelity)
         padded = volume.padded(fidelity.padding)
-        polarised = propagation.carries_polarisation and microscope.turns
+        polarised = propagation.carries_polarisation and microscope.turns_polarisation
         crossing = propagation.prepare(padded, fidelity, plane, polarised=polarised)
         found = ()
         if fidelity.object_aberration is not None:
@@ -67,7 +67,9 @@ class Passage:
         self, microscope: Microscope, levels: Levels | None, batches: Batches
     ) -> Float[Tensor, "prism focus y x"]:
         """The images in light of one wavelength."""
-        delta, n0, grid = self.volume.delta, self.volume.background, self.volume.grid
+        volume, fidelity = self.volume, self.fidelity
+        scene = microscope, self.acquisition, fidelity.defocus, fidelity.band_limit
+        imaging = Imaging(volume.grid, volume.background, self.plane, *scene)
 
         def intensity(momentum: Tensor, weights: Tensor) -> Tensor:
             def spread(field: Tensor) -> Tensor:
@@ -75,22 +77,11 @@ class Passage:
 
             wavelength, slabs = microscope.wavelength, batches.slabs
             spectrum = self.crossing.spectrum(wavelength, momentum, slabs=slabs, to_spectrum=spread)
-            return form_image(
-                spectrum if spectrum.shape[1] > 1 else spectrum[:, 0],
-                grid,
-                n0,
-                self.plane,
-                momentum,
-                weights,
-                microscope,
-                self.acquisition,
-                self.fidelity.defocus,
-                band_limit=self.fidelity.band_limit,
-            )
+            return imaging.intensity(spectrum, momentum, weights)
 
-        sources = microscope.sources(self.fidelity.sources, dtype=delta.dtype, device=delta.device)
+        sources = microscope.sources(fidelity.sources, dtype=volume.delta.dtype, device=volume.delta.device)
         total = sum_over_sources(intensity, sources, batches.sources)
-        return seen(total, grid, self.fidelity.padding, microscope)
+        return seen(total, volume.grid, fidelity.padding, microscope)
 
     def _spread(self, field: Tensor, levels: Levels, microscope: Microscope, momentum: Tensor) -> Tensor:
         """The spectrum of a field each of whose points has a defocus of its own."""
@@ -122,10 +113,11 @@ class FieldPassage:
         spectra = to_spectrum(F.pad(self.transmission, (pad,) * 4, value=1.0))
         momentum, weights = self.microscope.sources(self.fidelity.sources, dtype=real.dtype, device=real.device)
 
+        scene = self.microscope, self.acquisition, self.fidelity.defocus, self.fidelity.band_limit
+        imaging = Imaging(grid, self.background, 0.0, *scene)
+
         def intensity(momentum: Tensor, weights: Tensor, spectra: Tensor) -> Tensor:
-            scene = self.microscope, self.acquisition, self.fidelity.defocus
-            waves = spectra, grid, self.background, 0.0, momentum, weights
-            return form_image(*waves, *scene, band_limit=self.fidelity.band_limit)
+            return imaging.intensity(spectra[:, None], momentum, weights)
 
         own = spectra if spectra.ndim == 3 else spectra.expand(len(weights), -1, -1)
         total = sum_over_sources(intensity, (momentum, weights, own), batches.sources)

@@ -1,1 +1,1 @@
-"""From a field's spectrum behind the specimen to intensities on the camera."""
+"""From the spectrum of the field behind the specimen to intensities in the image plane."""

@@ -1,10 +1,10 @@
 """The few frequencies of an array that a pupil passes, and the coarse array that holds their intensities exactly.
 
-A pupil of aperture NA passes of each source's envelope the frequencies f with |f + f_s| ≤ NA/λ: a disc about −f_s whose
-diameter 2·NA/λ is most often much less than what the array holds, 1/dx. All that transfer functions do is done within a
-rectangle about that disc. An intensity's frequencies are differences of two in one disc, so that they lie within
-±2·NA/λ whatever the source: where voxels are finer than that asks for, intensities are summed on coarser ones and
-brought to the array's by trigonometric interpolation, once for all sources. Both are exact.
+A pupil of aperture NA passes those frequencies f of a source's envelope for which |f + f_s| ≤ NA/λ. They fill a disc
+about −f_s of diameter 2·NA/λ, most often much less than the array holds, 1/dx. Pupil, defocus and prism are computed
+in a rectangle about that disc only. An intensity's frequencies are differences of two frequencies of one disc: they lie
+within ±2·NA/λ, whatever the source. Where the voxels are finer than this needs, intensities are summed on a coarser
+array, and trigonometric interpolation brings the sum to the voxels, once for all sources. Both steps are exact.
 """
 
 import math
@@ -18,19 +18,20 @@ from torch import Tensor
 
 from torchdic.grid import Grid
 
-# Of the array's pixels, the most that a window or a coarser array may have to be worth its indices or interpolation.
+# A window or a coarser array of more than this part of the array's pixels isn't worth its indices or interpolation.
 WORTHWHILE = 0.6
 
-# Part of the pupil's radius by which windows are wider than it, so that rounding loses no frequency at its edge.
+# Windows are wider than the pupil by this part of its radius, so that rounding loses no frequency at its edge.
 _MARGIN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Passband:
-    """A window of each source's spectrum that holds all that a pupil passes.
+    """A window of each source's spectrum that holds all frequencies that a pupil passes.
 
-    indices: of its waves in the flattened array (y, x), in rising order of frequency. frequencies: of its waves, in
-    1/µm. shape: of the array (y, x) that holds the intensities of its fields.
+    indices: of the window's waves in the flattened array (y, x), in rising order of frequency.
+    frequencies: of the window's waves, in 1/µm.
+    shape: of the array (y, x) that holds the intensities of the window's fields.
     """
 
     indices: Int[Tensor, "source v u"]
@@ -39,7 +40,7 @@ class Passband:
 
     @classmethod
     def around(cls, grid: Grid, wavelength: float, na: float, momentum: Float[Tensor, "source 2"]) -> "Passband | None":
-        """The window of each source's |λf + p0| ≤ na; None where it would be most of the array."""
+        """The window about |λf + p0| ≤ na of each source; None where it would be most of the array."""
         found = sizes(grid, wavelength, na)
         if found is None:
             return None
@@ -57,17 +58,17 @@ class Passband:
         frequencies = grid.frequencies(dtype=momentum.dtype, device=momentum.device).flatten(1)[:, indices]
         return cls(indices, frequencies.movedim(0, 1), shape)
 
-    def window(self, spectrum: Complex[Tensor, "*component source y x"]) -> Complex[Tensor, "*component source v u"]:
+    def window(self, spectrum: Complex[Tensor, "source component y x"]) -> Complex[Tensor, "source component v u"]:
         """Each source's spectrum within its window."""
-        # an index keeps less than `gather` does, whose backward pass holds on to the whole spectrum
+        # indexing keeps less for the backward pass than `gather`, which keeps the whole spectrum
         sources = torch.arange(len(self.indices), device=spectrum.device)[:, None, None]
-        return spectrum.flatten(-2)[..., sources, self.indices]
+        return spectrum.flatten(-2).movedim(1, 0)[..., sources, self.indices].movedim(0, 1)
 
 
 def sizes(grid: Grid, wavelength: float, na: float) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """Shapes (y, x) of a source's window and of the array for its intensities; None where nothing would be gained."""
+    """Shapes (y, x) of a source's window and of the array for its intensities; None where a window gains nothing."""
     ny, nx = grid.shape[1:]
-    # whole bins of frequency that lie across the disc at most
+    # the most whole bins of frequency that fit across the disc
     v, u = (min(n, math.floor(2 * r) + 1) for n, r in zip((ny, nx), _radii(grid, wavelength, na), strict=True))
     if v * u > WORTHWHILE * ny * nx:
         return None
@@ -76,14 +77,17 @@ def sizes(grid: Grid, wavelength: float, na: float) -> tuple[tuple[int, int], tu
 
 
 def _radii(grid: Grid, wavelength: float, na: float) -> list[float]:
-    """Bins of frequency from the disc's middle to its edge, along y and x."""
+    """The disc's radius in bins of frequency, along y and x."""
     return [na * (1 + _MARGIN) * extent / wavelength for extent in grid.extent[1:]]
 
 
 def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int, int]) -> Float[Tensor, "*image y x"]:
-    """Intensities at the pixels of an array of that shape (y, x), the same along an axis or finer.
+    """Intensities on an array of as many or more pixels, by trigonometric interpolation.
 
-    Of the trigonometric polynomial through them: exact for frequencies below half of a coarser axis's number of pixels.
+    intensity: (…, row, column), periodic.
+    shape: of the new array (y, x), along no axis smaller.
+
+    Exact for frequencies below half of the number of pixels along each axis that gets finer.
     """
     (rows, columns), (ny, nx) = intensity.shape[-2:], shape
     if (rows, columns) == (ny, nx):
@@ -95,6 +99,6 @@ def interpolate(intensity: Float[Tensor, "*image row column"], shape: tuple[int,
         half = (rows - 1) // 2
         nothing = spectrum.new_zeros(*spectrum.shape[:-2], ny - 2 * half - 1, spectrum.shape[-1])
         spectrum = torch.cat((spectrum[..., : half + 1, :], nothing, spectrum[..., rows - half :, :]), -2)
-    # axis by axis, which takes less memory than both at once; what is dark may come out below 0 by rounding
+    # axis by axis, which takes less memory than both at once; rounding may bring dark pixels below 0
     spectrum = torch.fft.ifft(spectrum, dim=-2, norm="forward")
     return torch.fft.irfft(spectrum, n=nx, norm="forward").clamp_min(0)

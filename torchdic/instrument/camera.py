@@ -1,4 +1,4 @@
-"""The camera: its pixels, and what it records of an image's intensity."""
+"""The camera: its pixels, and the noise and counts with which it records an intensity."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Real
 from torch import Tensor
 
-# Part of a pixel by which rounding may let an image fall short of a whole number of pixels.
+# An image may fall short of a whole number of pixels by this part of a pixel, because of rounding.
 _ROUNDING = 1e-6
 
 
@@ -15,17 +15,19 @@ _ROUNDING = 1e-6
 class Camera:
     """A camera that counts photoelectrons.
 
-    `torchdic.image` gives the noiseless intensity, on the camera's pixels where it has a `pixel_size` and on the
-    volume's voxel centres where not; `record` draws a recording from it.
+    `torchdic.image` gives the noiseless intensity: on the camera's pixels where it has a `pixel_size`, and on the
+    volume's voxel centres where it has none. `record` draws a noisy recording from that intensity.
 
-    photons: electrons per pixel in the empty bright field; None is a camera without shot noise. read_noise: standard
-    deviation in electrons; None is none. bits: bit depth, 1 to 16; None records intensities relative to the empty
-    bright field instead of counts. gain: counts per electron, or counts of the empty bright field where there are no
-    photons; None is 1 count per electron. offset: dark counts; None is none. pixel_size: side in µm of a square pixel
-    that sees its whole area. magnification: between specimen and camera; None where `pixel_size` is that in the
-    specimen.
-    Raises ValueError where a number isn't positive, read noise has no photons to be compared with, gain or offset no
-    bits that make counts, bits no electrons or gain, or a magnification no pixels.
+    photons: electrons per pixel in the empty bright field; None is a camera without shot noise.
+    read_noise: standard deviation in electrons; None is a camera without read noise.
+    gain: counts per electron, or of the empty bright field where `photons` is None; None is 1 count per electron.
+    offset: dark counts; None is no offset.
+    bits: bit depth, 1 to 16; None records intensities relative to the empty bright field instead of counts.
+    pixel_size: side in µm of a square pixel, which averages over its whole area; None is the volume's voxels.
+    magnification: between specimen and camera; None where `pixel_size` is measured in the specimen.
+
+    Raises ValueError where a number isn't positive, for read noise without photons, gain or offset without bits, bits
+    with neither photons nor gain, and a magnification without a pixel size.
     """
 
     photons: float | None = None
@@ -62,16 +64,19 @@ class Camera:
             raise ValueError(f"magnification {self.magnification} needs the pixel_size that it makes smaller")
 
     def pixel_spacing(self, spacing: tuple[float, float]) -> tuple[float, float]:
-        """Side (y, x) in µm of a pixel in the specimen; `spacing`, the voxels', where there is no pixel size."""
+        """Sides (y, x) in µm of a pixel, measured in the specimen.
+
+        spacing: of the voxels (y, x) in µm; the result where the camera has no pixel size.
+        """
         if self.pixel_size is None:
             return spacing
         side = self.pixel_size / (self.magnification or 1)
         return side, side
 
     def pixels(self, shape: tuple[int, int], spacing: tuple[float, float]) -> tuple[int, int]:
-        """How many whole pixels (y, x) fit into an image of that shape in voxels and spacing in µm.
+        """How many whole pixels (y, x) fit into an image. Raises ValueError where none fits.
 
-        Raises ValueError where none does.
+        shape: of the image in voxels (y, x). spacing: of the voxels (y, x) in µm.
         """
         count = [
             int(n * d / side + _ROUNDING)
@@ -86,15 +91,18 @@ class Camera:
     def integrate(
         self, intensity: Float[Tensor, "*image y x"], spacing: tuple[float, float], seen: tuple[int, int] | None = None
     ) -> Float[Tensor, "*image row column"]:
-        """The mean of the intensity over each pixel's area, exact for what the voxels can hold.
+        """The mean of the intensity over each pixel's area; the intensity itself where there is no pixel size.
 
-        intensity: at voxel centres, periodic as the microscope's images are. spacing: of its voxels (y, x) in µm. seen:
-        voxels (y, x) about its centre that the camera looks at; None is all. Pixels are centred as the voxels are:
-        pixel j has its centre at (j − (N−1)/2)·side; what makes no whole pixel at the edges is left out.
+        intensity: at voxel centres (…, y, x), periodic as the microscope's images are.
+        spacing: of the voxels (y, x) in µm.
+        seen: how many voxels (y, x) about the centre the camera looks at; None is all.
 
-        Between voxels the intensity is the trigonometric polynomial through them, Σ_f c(f)·exp(2πi f·x), of which a
-        pixel of side w sees Σ_f sinc(f·w)·c(f)·exp(2πi f·x_j): a matrix product along each axis. So pixels may have any
-        size, whole voxels or not. Without a pixel size the intensity comes back as it is.
+        Pixels are centred as voxels are: pixel j has its centre at (j − (N−1)/2)·side. At the edges, whatever is no
+        whole pixel is left out.
+
+        Between voxels the intensity is the trigonometric polynomial through them, Σ_f c(f)·exp(2πi f·x). A pixel of
+        side w sees Σ_f sinc(f·w)·c(f)·exp(2πi f·x_j) of it, which is a matrix product along each axis. This is exact,
+        and pixels may have any size, whole voxels or not.
         """
         if self.pixel_size is None:
             return intensity
@@ -107,14 +115,17 @@ class Camera:
         return rows @ intensity @ columns.T
 
     def record(self, intensity: Float[Tensor, "*image"], generator: torch.Generator) -> Real[Tensor, "*image"]:
-        """One noisy recording of an intensity that is relative to the empty bright field; its shape and device.
+        """One noisy recording, of the same shape and on the same device.
 
-        Relative to the empty bright field too and of the intensity's dtype without `bits`; with them counts, rounded
-        and clipped to 0 … 2^bits − 1, in uint8 up to 8 bits and in uint16 above.
+        intensity: relative to the empty bright field.
+        generator: of the random numbers, on the intensity's device.
+
+        With `bits` the recording is in counts, rounded and clipped to 0 … 2^bits − 1; uint8 up to 8 bits, uint16 above.
+        Without `bits` it is relative to the empty bright field, in the intensity's dtype.
         """
         signal = intensity
         if self.photons is not None:
-            # a trigonometric polynomial may undershoot 0 between voxels
+            # between voxels the trigonometric polynomial may fall below 0
             signal = torch.poisson(intensity.clamp_min(0) * self.photons, generator=generator)
             if self.read_noise is not None:
                 noise = torch.randn(
@@ -131,11 +142,11 @@ class Camera:
 
 
 def _pixel_means(voxels: int, spacing: float, pixels: int, side: float) -> Float[Tensor, "pixel voxel"]:
-    """The matrix from values at voxel centres to means over pixels along one axis, float64."""
+    """The matrix that takes values at voxel centres to means over pixels, along one axis; float64."""
     f = torch.fft.fftfreq(voxels, spacing, dtype=torch.float64)
     voxel = (torch.arange(voxels, dtype=torch.float64) - (voxels - 1) / 2) * spacing
     pixel = (torch.arange(pixels, dtype=torch.float64) - (pixels - 1) / 2) * side
     at_pixel, at_voxel = (2 * math.pi * x[:, None] * f for x in (pixel, voxel))
     seen = torch.sinc(f * side) / voxels
-    # cos of the difference; sines, odd in f, cancel
+    # the cosine of a difference; the sine cancels, because it is odd in f
     return (seen * at_pixel.cos()) @ at_voxel.cos().T + (seen * at_pixel.sin()) @ at_voxel.sin().T

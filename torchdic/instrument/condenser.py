@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Share of the directions at least that passes a pupil which divides the aperture: the image is theirs in the main.
+# Where a pupil divides the aperture, at least this share of the directions passes it: most of the image is theirs.
 WITHIN = 0.75
 
 
@@ -17,10 +17,13 @@ WITHIN = 0.75
 class Spectrum:
     """Light of several wavelengths, whose images add up.
 
-    wavelengths: in vacuum, µm. weights: their shares of what the camera records of the empty bright field (the lamp's
-    power times filters times quantum efficiency), made to sum to 1; None means equal ones. The directions n·sinθ of the
-    sources are the same for each. Phases given in rad, a prism's bias and Zernike aberrations, hold at each wavelength
-    (an achromatic compensator, so that an empty field stays sin²(bias/2)); lengths, a layer's thickness, scale with it.
+    wavelengths: in vacuum, µm.
+    weights: each wavelength's share of the light that the camera records in the empty bright field (the lamp's power
+    times filters times quantum efficiency), normalised to sum to 1; None means equal shares.
+
+    The directions n·sinθ of the sources are the same for each wavelength. Phases in rad (a prism's bias, Zernike
+    aberrations) hold at each wavelength, as with an achromatic compensator, so that an empty field stays sin²(bias/2).
+    The phase of a length in µm, such as a layer's thickness, changes with the wavelength.
     Raises ValueError for no wavelengths, one that isn't positive, a negative weight or unequal numbers of the two.
     """
 
@@ -43,7 +46,7 @@ class Spectrum:
 
     @property
     def shares(self) -> tuple[float, ...]:
-        """The weights, made to sum to 1."""
+        """The weights, normalised to sum to 1."""
         weights = (1.0,) * len(self.wavelengths) if self.weights is None else self.weights
         return tuple(weight / sum(weights) for weight in weights)
 
@@ -52,11 +55,13 @@ class Spectrum:
 class Condenser:
     """A condenser's aperture, filled evenly with mutually incoherent plane waves.
 
-    na: its numerical aperture; 0 is one axial plane wave. points: directions (source, 2), each n·(sinθ_y, sinθ_x) as
-    given, in place of the disc of `na`. weights: their shares (source,), made to sum to 1; None means equal ones.
-    inner_na: the aperture below which a ring stop blocks the light; None is a disc, `na` itself a ring.
+    na: numerical aperture; 0 is one axial plane wave.
+    points: directions (source, 2), each n·(sinθ_y, sinθ_x), that replace the disc of `na`; None takes the disc.
+    weights: the points' shares (source,) of the light, normalised to sum to 1; None means equal shares.
+    inner_na: aperture below which a stop blocks the light; None is a full disc, and `na` itself is a thin ring.
+
     Raises ValueError for a negative aperture or weight, weights without points, unequal numbers of the two, and an
-    inner aperture above `na` or beside points.
+    inner aperture that is above `na` or comes with points.
     """
 
     na: float
@@ -100,10 +105,12 @@ class Condenser:
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
-        """Directions n·sinθ (source, 2) and weights (source,) of sum 1; at most `count` unless points are given.
+        """Directions n·sinθ (source, 2) and weights (source,) that sum to 1.
 
-        pupil: an objective's NA. Where it divides the aperture, the light within and the light beyond have directions
-        of their own (see `aperture_quadrature`).
+        count: the most directions; given points are used all, whatever the count.
+        pupil: NA of the objective. Where it divides the aperture, the light within it and the light beyond it get
+        directions of their own, see `aperture_quadrature`.
+        dtype, device: of the result.
         """
         if self.points is not None:
             points = self.points
@@ -121,14 +128,18 @@ class Condenser:
 def aperture_quadrature(
     count: int, na: float, inner_na: float = 0.0, pupil: float | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (m, 2) between two radii and weights (m,) that sum to 1, m ≤ count: `disc_quadrature`, or two of them.
+    """Points (m, 2) of a ring or disc and weights (m,) that sum to 1, m ≤ count, for the mean over it.
 
-    pupil: a radius at which the integrand jumps, as it does at the edge of the objective's pupil, where direct light
-    passes or not. Each side then has a rule of its own, with its area's share of the weight, so that as much direct
-    light passes as should; otherwise the empty field would be wrong by the weight of whole rings. Both are `even`. With
-    too few points for two rules there is one. Raises ValueError as `disc_quadrature` does.
+    count: the most points.
+    na, inner_na: its outer and inner radius.
+    pupil: a radius at which the integrand jumps: inside the objective's pupil the direct light passes, outside it
+    doesn't. Each side then has a rule of its own, with weights that sum to the share of its area. So the right part of
+    the direct light passes; a single rule would be wrong by the weight of whole rings.
+
+    Each rule is a `disc_quadrature`, `even` where there are two. Where there are too few points for two rules, there is
+    one. Raises ValueError as `disc_quadrature` does.
     """
-    least = 1 if inner_na == 0 else 2  # directions within the pupil
+    least = 1 if inner_na == 0 else 2  # the fewest directions within the pupil
     if pupil is None or not inner_na < pupil < na or count < least + 2:
         points, weights = disc_quadrature(count, inner_na / na)
         return na * points, weights
@@ -142,12 +153,16 @@ def aperture_quadrature(
 def disc_quadrature(count: int, hole: float = 0.0, *, even: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Points (m, 2) in the unit disc and weights (m,) that sum to 1, m ≤ count, for the mean over the disc.
 
-    K rings at the Gauss nodes of r², each with M equally spaced azimuths: exact for polynomials of degree below
-    min(4K, M). The rings are turned by half a step against each other, so that what their azimuths miss beyond that, up
-    to about 2M, nearly cancels: K and M are chosen for it, and where they tie more rings are.
-    hole: radius from 0 to 1 within which there is no light; the nodes then lie between hole² and 1, and the narrower
-    that interval, the fewer rings it takes. even: whether M must be, where there are four points or more.
-    Raises ValueError for no sources, or a single one where there is a hole, which would light from one side.
+    count: the most points.
+    hole: radius from 0 to 1 within which there is no light.
+    even: whether each ring has an even number of points, so that light comes from opposite sides alike; it takes four
+    points or more.
+
+    The points lie on K rings at the Gauss nodes of r², each with M equally spaced azimuths: exact for polynomials of
+    degree below min(4K, M). Neighbouring rings are turned against each other by half a step. So their errors beyond
+    that degree nearly cancel, up to about degree 2M. K and M are chosen for the highest degree, with more rings where
+    two choices tie. Around a hole the nodes lie between hole² and 1; the narrower that interval, the fewer rings.
+    Raises ValueError for no sources, or a single source around a hole, whose light would come from one side.
     """
     if count < 1:
         raise ValueError(f"a condenser needs at least 1 source, not {count}")

@@ -1,9 +1,10 @@
-"""Polarised light: Jones's 2×2 algebra, and the polarising optics of a DIC microscope.
+"""Polarised light: Jones's 2×2 algebra.
 
-Fields vary as exp(+ikz), so a slow axis, whose path is optically longer, gains phase: a retarder of retardance Γ
-multiplies the component along its slow axis by exp(+iΓ/2) and the other by exp(−iΓ/2). Angles in rad are counted from
-axis 1 towards axis 2; the Nomarski prism's beam 1 is polarised along axis 1 and beam 2 along axis 2. Angles and
-retardances are numbers, which give float64, or tensors (any batch shape), which keep their dtype, device and graph.
+Fields vary as exp(+ikz), so light along a slow axis, whose optical path is longer, gains phase: a retarder of
+retardance Γ multiplies the component along its slow axis by exp(+iΓ/2) and the other by exp(−iΓ/2). Angles in rad are
+counted from axis 1 towards axis 2; the Nomarski prism's beam 1 is polarised along axis 1 and beam 2 along axis 2.
+Angles and retardances are numbers, which give float64, or tensors of any batch shape, which keep their dtype, device
+and graph.
 
 R. C. Jones, J. Opt. Soc. Am. 31, 488 (1941); E. Wolf, Nuovo Cimento 13, 1165 (1959) for the coherency matrix.
 """
@@ -23,13 +24,13 @@ def linear(angle: float | Tensor) -> Float[Tensor, "*batch 2"]:
 
 
 def rotation(angle: float | Tensor) -> Float[Tensor, "*batch 2 2"]:
-    """Turns the plane of polarisation by an angle, axis 1 towards axis 2; real."""
+    """A rotation of the plane of polarisation by an angle, axis 1 towards axis 2; real."""
     cos, sin = linear(angle).unbind(-1)
     return torch.stack((cos, -sin, sin, cos), -1).unflatten(-1, (2, 2))
 
 
 def polariser(angle: float | Tensor) -> Float[Tensor, "*batch 2 2"]:
-    """An ideal polariser, or analyser, that passes light polarised at an angle: the projection on it, real."""
+    """An ideal polariser or analyser: the projection on light polarised at an angle; real."""
     axis = linear(angle)
     return axis[..., :, None] * axis[..., None, :]
 
@@ -46,17 +47,17 @@ def retarder(retardance: float | Tensor, angle: float | Tensor) -> Complex[Tenso
 
 
 def half_wave_plate(angle: float | Tensor) -> Complex[Tensor, "*batch 2 2"]:
-    """A retarder of π: mirrors the plane of polarisation at its slow axis."""
+    """A retarder of π, which mirrors the plane of polarisation at its slow axis."""
     return retarder(math.pi, angle)
 
 
 def quarter_wave_plate(angle: float | Tensor) -> Complex[Tensor, "*batch 2 2"]:
-    """A retarder of π/2: makes light linear at 45° to its slow axis circular, and back."""
+    """A retarder of π/2, which turns light that is linear at 45° to its slow axis into circular light, and back."""
     return retarder(math.pi / 2, angle)
 
 
 def train(*elements: Inexact[Tensor, "... 2 2"]) -> Inexact[Tensor, "... 2 2"]:
-    """The Jones matrix of elements in the order in which light meets them; raises ValueError for none."""
+    """The Jones matrix of several elements, in the order in which light meets them. Raises ValueError for none."""
     if not elements:
         raise ValueError("a train of optics needs at least 1 element, not 0")
     return reduce(lambda before, element: _matmul(element, before), elements)
@@ -73,11 +74,14 @@ def intensity(light: Inexact[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
 
 
 def leaky(angle: float | Tensor, extinction: float | Tensor | None) -> Float[Tensor, "*batch 2 2"]:
-    """A†A of a polariser that also passes the share `extinction` r of crossed intensity: P + r(1 − P), real.
+    """A†A of a polariser that leaks: P + r(1 − P), real.
 
-    It is the coherency matrix behind it of unpolarised light that has unit intensity along each axis, and the matrix W
-    of the intensity E†WE that it passes. Linear in r, where the Jones matrix has a √r of infinite slope at 0. None is
-    an ideal polariser.
+    angle: of the light that it passes, rad.
+    extinction: the share r of crossed intensity that it lets pass; None is an ideal polariser.
+
+    For a polariser this is the coherency matrix of the light behind it, if unpolarised light of unit intensity along
+    each axis comes in. For an analyser it is the matrix W of the intensity E†WE that passes. It is linear in r; the
+    Jones matrix itself contains √r, whose slope at 0 is infinite.
     """
     if extinction is None:
         return polariser(angle)
@@ -92,7 +96,7 @@ def _real(value: float | Tensor) -> Tensor:
 
 
 def _alike(one: float | Tensor, other: float | Tensor) -> tuple[Tensor, Tensor]:
-    """Both as tensors of one dtype and device, those of a tensor where there is one."""
+    """Both as tensors of one dtype and device: those of the first tensor among them, or float64."""
     if isinstance(one, Tensor):
         return one, torch.as_tensor(other, dtype=one.dtype, device=one.device)
     other = _real(other)

@@ -1,4 +1,4 @@
-"""What the microscope is, and what was recorded with it."""
+"""The microscope, and what was recorded with it."""
 
 import math
 import warnings
@@ -15,20 +15,25 @@ from torchdic.instrument.camera import Camera
 from torchdic.instrument.condenser import Condenser, Spectrum
 from torchdic.instrument.objective import Objective
 from torchdic.instrument.polarisation import Polarisation
+from torchdic.instrument.polarised_lenses import JonesPupil
 from torchdic.instrument.prism import Prism
 from torchdic.scalar import number
 
 
 @dataclass(frozen=True, eq=False)
 class Microscope:
-    """What the microscope is.
+    """A microscope: what exists, whatever is recorded with it.
 
-    wavelength: in vacuum, µm. objective: None lets every propagating wave through. condenser: None is one axial plane
-    wave. camera: what it records of an image; the images of `image` are noiseless all the same. spectrum: light of
-    several wavelengths, among which `wavelength` is the nominal one; None is light of `wavelength` alone. polarisation:
-    None is ideal crossed polarisers. condenser_prism: whether a second prism in front of the condenser makes up for
-    each source's tilt, as in Nomarski's microscope; without it the beams of an oblique source differ by 2π f_s·s more,
-    and a wide condenser washes the contrast out, by 2J1(a)/a with a = 2π|s|NA_c/λ.
+    wavelength: in vacuum, µm.
+    objective: None lets every propagating wave through.
+    condenser: None is one axial plane wave.
+    camera: its pixels and its noise; the images of `image` are noiseless all the same.
+    spectrum: light of several wavelengths, of which `wavelength` is the nominal one; None is `wavelength` alone.
+    polarisation: errors of the polarising optics; None is ideal crossed polarisers.
+    condenser_prism: whether a second prism in front of the condenser cancels each source's tilt, as in Nomarski's
+    microscope. Without it the phase between the beams of an oblique source changes by 2π f_s·s, and a wide condenser
+    reduces the contrast by the factor 2J1(a)/a with a = 2π|s|NA_c/λ.
+
     Raises ValueError for a wavelength that isn't positive or lies outside the spectrum, and for Zernike terms of the
     polarisation's pupil without an objective.
     """
@@ -48,29 +53,34 @@ class Microscope:
             low, high = min(self.spectrum.wavelengths), max(self.spectrum.wavelengths)
             if not (low <= self.wavelength <= high):
                 raise ValueError(f"wavelength {self.wavelength} µm lies outside its spectrum, {low} to {high} µm")
-        pupil = None if self.polarisation is None else self.polarisation.pupil
-        if pupil is not None and pupil.strained and self.objective is None:
+        if self.lenses is not None and self.lenses.strained and self.objective is None:
             raise ValueError("polarisation pupil: Zernike terms need the radius of a pupil, and objective is None")
 
     @property
-    def vectorial(self) -> bool:
-        """Whether lenses mix the beams' polarisations, so that they are no scalar pair."""
-        return self.polarisation is not None and self.polarisation.vectorial
+    def polarisers(self) -> Polarisation | None:
+        """Polariser, analyser and compensator's plate; None where they are ideal."""
+        polarisation = self.polarisation
+        return polarisation if polarisation is not None and polarisation.declared else None
 
     @property
-    def turns(self) -> bool:
-        """Whether condenser and objective turn polarisation between pupil and specimen."""
+    def lenses(self) -> JonesPupil | None:
+        """What the lenses do to polarisation; None where they leave it alone, so that the two beams are scalar."""
         pupil = None if self.polarisation is None else self.polarisation.pupil
-        return pupil is not None and pupil.depolarisation
+        return pupil if pupil is not None and (pupil.strained or pupil.depolarisation) else None
+
+    @property
+    def turns_polarisation(self) -> bool:
+        """Whether lenses turn polarisation between pupil and specimen; bent rays then carry their polarisation."""
+        return self.lenses is not None and self.lenses.depolarisation
 
     @property
     def reach(self) -> float:
-        """The largest transverse momentum that an image's envelope can hold, NA_o + NA_c."""
+        """The largest transverse momentum n·sinθ in the image of an oblique source's envelope, NA_o + NA_c."""
         condenser = 0.0 if self.condenser is None else self.condenser.na
         return condenser + (0.0 if self.objective is None else self.objective.na)
 
     def colours(self) -> list[tuple["Microscope", float]]:
-        """A microscope of one wavelength for each of the light's, with its share; the shares sum to 1."""
+        """For each wavelength of the light, a microscope of that wavelength and its share; the shares sum to 1."""
         if self.spectrum is None:
             return [(self, 1.0)]
         return [
@@ -81,7 +91,7 @@ class Microscope:
     def sources(
         self, count: int, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
-        """Directions n·sinθ (source, 2) of the illumination and their weights (source,), as `Condenser.sources`."""
+        """Directions n·sinθ (source, 2) of the illumination and their weights (source,), see `Condenser.sources`."""
         condenser = self.condenser or Condenser(0.0)
         pupil = None if self.objective is None else self.objective.na
         return condenser.sources(count, pupil=pupil, dtype=dtype, device=device)
@@ -89,7 +99,7 @@ class Microscope:
     def lit_from(
         self, points: Float[Tensor, "source 2"], weights: Float[Tensor, " source"] | None = None
     ) -> "Microscope":
-        """The microscope with some of its condenser's directions alone."""
+        """The same microscope with these directions of the condenser only, see `Condenser`."""
         na = 0.0 if self.condenser is None else self.condenser.na
         return replace(self, condenser=Condenser(na, points, weights))
 
@@ -98,8 +108,10 @@ class Microscope:
 class Acquisition:
     """What was recorded: an image for each prism and each focus plane.
 
-    prisms: Prism settings; None is bright field. focus: depths z_f in µm that are sharp, numbers or 0-d tensors, which
-    are learned. Raises ValueError where either is empty or a focus isn't finite.
+    prisms: the prism's settings; None is bright field.
+    focus: depths z_f in µm that are sharp, numbers or 0-d tensors; tensors are learned.
+
+    Raises ValueError where either is empty, or a focus isn't finite.
     """
 
     prisms: Sequence[Prism | None] = (None,)
@@ -117,9 +129,10 @@ class Acquisition:
 
 
 def check_apertures(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> None:
-    """Raise ValueError where an aperture asks for light that the medium's index does not carry.
+    """Raise ValueError where an aperture exceeds the medium's index, so that no wave fills it.
 
-    dtype: in which p_z = √(n² − |p|²) must be above 0, whatever the rounding of both.
+    background: refractive index of the medium.
+    dtype: precision in which p_z = √(n² − |p|²) of each condenser direction must stay above 0 in spite of rounding.
     """
     condenser = microscope.condenser
     apertures = {"objective": microscope.objective, "condenser": condenser}
@@ -135,9 +148,13 @@ def check_apertures(microscope: Microscope, background: float, dtype: torch.dtyp
 
 
 def check_sampling(microscope: Microscope, grid: Grid) -> None:
-    """Warn with SamplingWarning, on behalf of a caller's caller, where voxels or frequencies are coarser than light."""
+    """Warn with SamplingWarning where voxels are too coarse for the light, or the array too small for the objective.
+
+    The warnings name the line of code that called `image` or another function that checks: two calls further out.
+    """
     reach = microscope.reach
-    coarsest = max((d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=0.0)
+    sides = [(n, d) for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1]
+    coarsest = max((d for _, d in sides), default=0.0)
     shortest = min(part.wavelength for part, _ in microscope.colours())
     if reach > 0 and coarsest > shortest / (2 * reach):
         warnings.warn(
@@ -146,7 +163,7 @@ def check_sampling(microscope: Microscope, grid: Grid) -> None:
             SamplingWarning,
             stacklevel=3,
         )
-    widest = max((n * d for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1), default=math.inf)
+    widest = max((n * d for n, d in sides), default=math.inf)
     if microscope.objective is not None and microscope.objective.na < shortest / widest:
         warnings.warn(
             f"objective NA {microscope.objective.na:g} is narrower than one frequency of the array, λ/L = "

@@ -1,4 +1,4 @@
-"""The objective's pupil: aperture, Zernike aberrations, apodisation and a layer that the design does not expect."""
+"""The objective: aperture, Zernike aberrations, apodisation, and a layer for which it is not designed."""
 
 import math
 from collections.abc import Mapping
@@ -16,12 +16,16 @@ from torchdic.scalar import number, scalar
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A plane-parallel layer between specimen and objective where the objective's design expects another index.
+    """A plane-parallel layer between specimen and objective whose index is not the one that the objective expects.
 
-    A cover glass too thick or too thin, or light that is focused some depth into a medium other than the immersion.
-    thickness: µm; below 0 where that much of the layer is missing. index: of the layer. design_index: of what the
-    design has in its place. Numbers or 0-d tensors, which are learned. Raises ValueError for a thickness that isn't
-    finite or an index below 1.
+    For example a cover glass that is too thick or too thin, or light focused into a medium other than the immersion.
+
+    thickness: µm; below 0 where that much of the layer is missing.
+    index: refractive index of the layer.
+    design_index: refractive index for which the objective is designed in its place.
+
+    They are numbers or 0-d tensors; tensors are learned. Raises ValueError for a thickness that isn't finite or an
+    index below 1.
     """
 
     thickness: float | Tensor
@@ -37,18 +41,20 @@ class Layer:
                 raise ValueError(f"layer {name} {value} must be a refractive index of at least 1")
 
     def phase(self, momentum: Float[Tensor, "source 2 y x"], wavelength: float) -> Float[Tensor, "source y x"]:
-        """k0·t·(√(n² − |p|²) − √(n_d² − |p|²)) in rad at each transverse momentum p; 0 where either is evanescent.
+        """The phase k0·t·(√(n² − |p|²) − √(n_d² − |p|²)) in rad; 0 where the wave is evanescent in either index.
 
-        It is exact, and whole: it keeps its piston k0·t·(n − n_d), which no image shows, and its defocus, by which for
-        small angles the plane z_f + t·n0·(1/n − 1/n_d) is sharp instead of z_f. Beyond these it is the spherical
-        aberration of Gibson & Lanni, J. Opt. Soc. Am. A 8, 1601 (1991).
+        momentum: p of each wave, n·sinθ as (y, x). wavelength: in vacuum, µm.
+
+        It is exact. It contains the piston k0·t·(n − n_d), which no image shows, and a defocus: for small angles the
+        plane z_f + t·n0·(1/n − 1/n_d) is sharp instead of z_f. The rest is the spherical aberration of Gibson & Lanni,
+        J. Opt. Soc. Am. A 8, 1601 (1991).
         """
         t, n, design = (scalar(v, momentum) for v in (self.thickness, self.index, self.design_index))
         transverse = momentum.square().sum(1)
         propagates = (transverse < n.square()) & (transverse < design.square())
         transverse = torch.where(propagates, transverse, 0)  # keeps roots of negative numbers out of the gradient
         roots = (n.square() - transverse).sqrt() + (design.square() - transverse).sqrt()
-        # the difference of the roots without cancellation
+        # the difference of the two roots, written without cancellation
         return torch.where(propagates, 2 * math.pi / wavelength * t * (n - design) * (n + design) / roots, 0)
 
 
@@ -56,11 +62,14 @@ class Layer:
 class Objective:
     """An objective.
 
-    na: numerical aperture. aberrations: Zernike coefficients {Noll index: rad}, rms phase over the pupil; numbers or
-    0-d tensors, which are learned; None for a perfect lens. apodisation: "aplanatic" for lenses that obey the sine
-    condition and conserve energy, see `apodise`; None for a pupil of even transmission. layer: what the light crosses
-    though the design expects another index; None where the design is met.
-    Raises ValueError for an aperture that isn't positive or beyond the layer's indices, or a Noll index below 1.
+    na: numerical aperture.
+    aberrations: Zernike coefficients {Noll index: rad}, rms phase over the pupil; numbers or 0-d tensors, of which
+    tensors are learned; None is a perfect lens.
+    apodisation: "aplanatic" for lenses that obey the sine condition and conserve energy, see `apodise`; None is a pupil
+    of even transmission.
+    layer: a layer for which the objective is not designed; None is no such layer.
+
+    Raises ValueError for an aperture that isn't positive or exceeds a layer's index, and for a Noll index below 1.
     """
 
     na: float
@@ -85,12 +94,15 @@ class Objective:
                 raise ValueError(f"objective NA {self.na:g} exceeds the layer's index {lowest:g}")
 
     def aperture(self, momentum: Float[Tensor, "source 2 y x"]) -> Tensor:
-        """Which transverse momenta n·sinθ the pupil lets through, shape (source, y, x); its edge counts as inside."""
+        """Which waves lie within the aperture (source, y, x); its edge counts as inside.
+
+        momentum: of each wave, n·sinθ as (y, x).
+        """
         rounding = 8 * torch.finfo(momentum.dtype).eps
         return momentum.square().sum(1) <= self.na**2 * (1 + rounding)
 
     def phase(self, momentum: Float[Tensor, "source 2 y x"]) -> Float[Tensor, "source y x"] | None:
-        """The aberrations' phase in rad at each transverse momentum, or None for a perfect lens."""
+        """The aberrations' phase in rad; None for a perfect lens. momentum: of each wave, n·sinθ as (y, x)."""
         if not self.aberrations:
             return None
         pupil = momentum / self.na
@@ -105,10 +117,12 @@ class Objective:
         wavelength: float,
         background: Tensor,
     ) -> Float[Tensor, "source y x"] | Complex[Tensor, "source y x"] | None:
-        """What multiplies the field's spectrum within the aperture; None: nothing does.
+        """The factor of each wave within the aperture; None where there are no aberrations, apodisation or layer.
 
-        momentum: n·sinθ of the field's waves, direct: of each source's own one. wavelength: in vacuum, µm. background:
-        index of the medium.
+        momentum: of each wave, n·sinθ as (y, x).
+        direct: of each source's own wave.
+        wavelength: in vacuum, µm.
+        background: refractive index of the medium.
         """
         phases = [self.phase(momentum), None if self.layer is None else self.layer.phase(momentum, wavelength)]
         present = [phase for phase in phases if phase is not None]
@@ -122,13 +136,17 @@ class Objective:
 def apodise(
     momentum: Float[Tensor, "source 2 y x"], direct: Float[Tensor, "source 2"], background: Tensor
 ) -> Float[Tensor, "source y x"]:
-    """The aplanatic amplitude √(cosθ/cosθ0) of each wave at θ that an illuminating wave at θ0 excites.
+    """The aplanatic amplitude √(cosθ/cosθ0) of a wave at θ in light of a source at θ0; 0 where it is evanescent.
 
-    Detection: a plane wave of amplitude A carries the flux |A|²·cosθ through a plane of focus, and behind the objective
-    all of it along the axis: A gains √cosθ (Richards & Wolf, Proc. R. Soc. A 253, 358, 1959; a point source's waves
-    have the amplitude 1/cosθ by Weyl's expansion, so that they fill a pupil as 1/√cosθ). Illumination: an evenly lit
-    pupil of an aplanatic condenser sends equal flux in every direction n·sinθ0, of the amplitude 1/√cosθ0. The direct
-    light gains 1, so an empty field is what it is without. 0 where a wave is evanescent.
+    momentum: of each wave, n·sinθ as (y, x).
+    direct: of each source's own wave.
+    background: refractive index of the medium.
+
+    Detection: a plane wave of amplitude A carries the flux |A|²·cosθ through a plane of focus. Behind the objective all
+    of this flux runs along the axis, so A gains √cosθ (Richards & Wolf, Proc. R. Soc. A 253, 358, 1959; the waves of a
+    point source have the amplitude 1/cosθ by Weyl's expansion, so that they fill a pupil as 1/√cosθ). Illumination: an
+    aplanatic condenser with an evenly lit pupil sends equal flux in every direction n·sinθ0, with amplitude 1/√cosθ0.
+    The factor of the direct light is 1, so apodisation leaves an empty field unchanged.
     """
     squared = background**2 - momentum.square().sum(1)
     squared0 = background**2 - direct.square().sum(-1)

@@ -2,33 +2,44 @@
 
 import math
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Complex, Float, Inexact
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.instrument.jones import apply, leaky, linear, retarder, train
 from torchdic.instrument.polarised_lenses import JonesPupil
-from torchdic.scalar import number, scalar
+from torchdic.scalar import number
+
+
+class PureStates(NamedTuple):
+    """Light, or what an analyser passes, as a sum of pure states: shares (state,) and Jones vectors (state, 2)."""
+
+    shares: Float[Tensor, " state"]
+    vectors: Float[Tensor, "state 2"] | Complex[Tensor, "state 2"]
 
 
 @dataclass(frozen=True, eq=False)
 class Polarisation:
     """What is not ideal about the polarising optics of a DIC microscope; what is None is ideal, and costs nothing.
 
-    polariser_extinction, analyser_extinction: share of crossed intensity that each lets pass, 0 up to 1.
-    analyser_error: rad by which the analyser is turned from its crossed position. retardance_error: rad by which the
-    plate of de Sénarmont's compensator exceeds a quarter wave; to declare it, were it 0, is to say that each prism's
-    bias is set by the compensator, with the polariser turned by half the bias. Numbers or 0-d tensors; tensors are
-    learned. These act on DIC images alone: a bright field has no polarisers. pupil: what the lenses between do to
-    polarisation, which shows in bright field too, then in unpolarised light.
+    polariser_extinction, analyser_extinction: the share of crossed intensity that polariser and analyser let pass, from
+    0 up to below 1.
+    analyser_error: angle in rad by which the analyser is turned from its crossed position.
+    retardance_error: rad by which the plate of de Sénarmont's compensator exceeds a quarter wave. To give it, even as
+    0, says that the compensator sets each prism's bias: the polariser is then turned by half the bias.
+    pupil: what the lenses between polariser and analyser do to polarisation.
+
+    All but the pupil are numbers or 0-d tensors; tensors are learned. They act on DIC images alone, because a bright
+    field has no polarisers. The pupil acts on bright field too, whose light is then unpolarised.
     Raises ValueError where a value is not finite or an extinction lies outside [0, 1).
 
     The polariser stands at 45° + t to the prism's axes, the plate's slow axis at 45°, the analyser at −45° + e. With
-    K = diag(e^{iϑ}, e^{−iϑ}) the two beams, ϑ = π f·s + bias/2, and J the light's coherency matrix in front of them,
-    I = tr(W K J K†). So I = sin²ϑ if all is ideal, and for an analyser off by e the amplitude is
-    i·sinϑ·cos e + cosϑ·sin e; a plate of retardance π/2 + δ makes the beams' intensities 1 ± sin(bias)·sin δ and
-    their interference cos(bias) + i·sin(bias)·cos δ, which an empty field doesn't show.
+    K = diag(e^{iϑ}, e^{−iϑ}) the two beams, ϑ = π f·s + bias/2, W = A†A of the analyser (`torchdic.instrument.jones`)
+    and J the light's coherency matrix in front of the beams, I = tr(W K J K†). So I = sin²ϑ if all is ideal. For an
+    analyser off by e the amplitude is i·sinϑ·cos e + cosϑ·sin e. A plate of retardance π/2 + δ makes the beams'
+    intensities 1 ± sin(bias)·sin δ and their interference cos(bias) + i·sin(bias)·cos δ; an empty field shows neither.
     """
 
     polariser_extinction: float | Tensor | None = None
@@ -38,87 +49,68 @@ class Polarisation:
     pupil: JonesPupil | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is None or field.name == "pupil":
-                continue
+        for name, value in self.declared.items():
             plain = number(value)
             if not math.isfinite(plain):
-                raise ValueError(f"{field.name} {plain} must be a finite number")
-            if field.name.endswith("extinction") and not (0 <= plain < 1):
-                raise ValueError(f"{field.name} {plain} must be at least 0 and below 1: a share of crossed light")
+                raise ValueError(f"{name} {plain} must be a finite number")
+            if name.endswith("extinction") and not (0 <= plain < 1):
+                raise ValueError(f"{name} {plain} must be at least 0 and below 1: a share of crossed light")
 
     @property
-    def ideal(self) -> bool:
-        """Whether nothing is declared: the two beams are then a scalar pair."""
-        errors = (getattr(self, field.name) for field in fields(self) if field.name != "pupil")
-        return not self.vectorial and all(error is None for error in errors)
-
-    @property
-    def vectorial(self) -> bool:
-        """Whether the pupil mixes the beams' polarisations, so that they are no scalar pair."""
-        return self.pupil is not None and not self.pupil.ideal
+    def declared(self) -> dict[str, float | Tensor]:
+        """What is given about polariser, analyser and plate, by name; empty where they are ideal."""
+        given = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "pupil"}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def states(self) -> int:
-        """Pure states of polariser and analyser, one each or two where it leaks, that add up to a DIC image."""
+        """How many pure states add up to a DIC image: polariser and analyser have one each, or two if they leak."""
         return (1 if self.polariser_extinction is None else 2) * (1 if self.analyser_extinction is None else 2)
 
     def form(self, bias: float | Tensor) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Complex[Tensor, ""]]:
-        """The intensity's quadratic form (a, b, c) in the fields S and C behind sinϑ and cosϑ, on the CPU.
+        """The coefficients (a, b, c) of the intensity as a quadratic form in two fields, in float64 on the CPU.
 
-        I = a·|S|² + b·|C|² + Re(c·C·S*), from K = cosϑ + iZ·sinϑ with Z = diag(1, −1): a = tr(WZJZ), b = tr(WJ),
-        c = −2i·tr(WJZ). bias: the prism's, in rad. float64, so that at extinction nothing but rounding is left of b.
-        The pupil has no part in it.
+        S and C are the field times sinϑ and cosϑ (the frequency's): I = a·|S|² + b·|C|² + Re(c·C·S*). From
+        K = cosϑ + iZ·sinϑ with Z = diag(1, −1): a = tr(WZJZ), b = tr(WJ), c = −2i·tr(WJZ). The lenses' pupil plays no
+        part. float64 leaves no more than its rounding of b at extinction.
+
+        bias: of the prism, rad.
         """
         analyser, light, plate = self._optics(bias)
         W, J = (leaky(*element).to(torch.complex128) for element in (analyser, light))
         if plate is not None:
-            # ϑ holds the bias, as the ideal compensator gives it: the last element takes it back out
+            # ϑ contains the bias that an ideal compensator would give: the last element takes it out again
             plate = train(plate, retarder(-_double(bias), 0.0))
             J = train(plate.mH, J, plate)
         Z = torch.tensor([1.0, -1.0], dtype=torch.float64)
         WJ = W * J.mT  # elementwise: the trace of a product
         return (WJ * (Z[:, None] * Z)).sum().real, WJ.sum().real, -2j * (WJ * Z[:, None]).sum()
 
-    def transfers(
-        self,
-        pupil: Inexact[Tensor, "#source 2 2 #y #x"],
-        half: Float[Tensor, "source y x"],
-        tilt: Float[Tensor, " source"] | None,
-        axis: Float[Tensor, " 2"],
-        bias: float | Tensor,
-        *,
-        turned: bool = False,
-    ) -> tuple[Float[Tensor, " state"], Complex[Tensor, "state component source y x"]]:
-        """What multiplies the spectrum for each pure state of the light, and the states' shares of the intensity.
+    def intensity(
+        self, crossed: Complex[Tensor, "source y x"], parallel: Complex[Tensor, "source y x"], bias: float | Tensor
+    ) -> Float[Tensor, "source y x"]:
+        """The intensity of two scalar beams.
 
-        Behind the analyser's state w, in light of the polariser's state v, the amplitude is Σ w_b* K_b J_ba C_a v_a: J
-        is the pupil in the frame of the prism, K_b = exp(±i(π(f + f_s)·s + bias/2)) the objective's prism, upper sign
-        for beam 1, and C_a = exp(∓iπ f_s·s) the condenser's. Ideal polarisers have one state each, leaky ones two. A
-        compensator's bias is given to the light in front of all these.
+        crossed, parallel: the fields S and C of `form`, behind sinϑ and cosϑ.
+        bias: of the prism, rad.
+        """
+        kinds = (crossed.real.dtype, crossed.real.dtype, crossed.dtype)
+        a, b, c = (v.to(crossed.device, kind) for v, kind in zip(self.form(bias), kinds, strict=True))
+        return a * _squared(crossed) + b * _squared(parallel) + (c * parallel * crossed.conj()).real
 
-        pupil: in the laboratory's frame. half: π(f + f_s)·s. tilt: π f_s·s, or None where there is no condenser prism.
-        axis: (cos, sin) of beam 1's polarisation in the laboratory. turned: whether the spectrum has the components
-        along +x and +y that light along +x gets in the specimen, which turns all light alike, or is a scalar.
+    def pure_states(self, bias: float | Tensor) -> tuple[PureStates, PureStates, float | Tensor]:
+        """The pure states of the light in front of the prisms and of the analyser, and the bias left to the prism.
+
+        A compensator gives its bias to the light and leaves 0 to the prism. Vectors are in the frame of the prism, in
+        float64 on the CPU.
+
+        bias: as the prism declares it, rad.
         """
         analyser, light, plate = self._optics(bias)
-        (shares, states), (passed, analysed) = _pure_states(*light), _pure_states(*analyser)
+        states = _pure_states(*light)
         if plate is not None:
-            states, bias = apply(plate, states), 0.0
-        kind, device = half.dtype, half.device
-        weights = (passed[:, None] * shares).flatten().to(device, kind)
-        cos, sin = axis
-        one, two = states.to(device, kind.to_complex())[:, None].unbind(-1)
-        if tilt is not None:
-            condenser = torch.polar(torch.ones_like(tilt), -tilt)
-            one, two = one * condenser, two * condenser.conj()
-        laboratory = torch.stack((cos * one - sin * two, sin * one + cos * two), -1)
-        x, y = _behind(pupil, laboratory, turned).unbind(3)
-        prism = torch.polar(torch.ones_like(half), half + scalar(bias, half) / 2)
-        beams = prism * (cos * x + sin * y), prism.conj() * (cos * y - sin * x)
-        first, second = analysed.to(device, kind)[:, :, None, None, None, None, None].unbind(1)
-        return weights, (first * beams[0] + second * beams[1]).flatten(0, 1)
+            states, bias = PureStates(states.shares, apply(plate, states.vectors)), 0.0
+        return states, _pure_states(*analyser), bias
 
     def _optics(
         self, bias: float | Tensor
@@ -138,37 +130,13 @@ class Polarisation:
             return analyser, (_double(math.pi / 4), p), None
         return analyser, (_double(bias) / 2 + math.pi / 4, p), retarder(delta + math.pi / 2, math.pi / 4)
 
-    def intensity(
-        self, crossed: Complex[Tensor, "source y x"], parallel: Complex[Tensor, "source y x"], bias: float | Tensor
-    ) -> Float[Tensor, "source y x"]:
-        """The intensity from the fields S and C behind sinϑ and cosϑ, see `form`."""
-        kinds = (crossed.real.dtype, crossed.real.dtype, crossed.dtype)
-        a, b, c = (v.to(crossed.device, kind) for v, kind in zip(self.form(bias), kinds, strict=True))
-        return a * _squared(crossed) + b * _squared(parallel) + (c * parallel * crossed.conj()).real
 
-
-def unpolarised(
-    pupil: Inexact[Tensor, "#source 2 2 #y #x"], *, turned: bool = False
-) -> tuple[Float[Tensor, " state"], Inexact[Tensor, "state component source y x"]]:
-    """`Polarisation.transfers` of a bright field, half of whose light comes in along x and half along y."""
-    real = pupil.real if pupil.is_complex() else pupil
-    behind = _behind(pupil, torch.eye(2, dtype=real.dtype, device=real.device)[:, None], turned)
-    return real.new_full((4,), 0.5), behind.movedim(3, 1).flatten(0, 1)
-
-
-def _behind(pupil: Tensor, light: Tensor, turned: bool) -> Tensor:
-    """Light (state, source, 2) behind the pupil, (state, component, source, 2, y, x); see `Polarisation.transfers`."""
-    parts = [light, torch.stack((-light[..., 1], light[..., 0]), -1)] if turned else [light]
-    x, y = torch.stack(parts, 1)[..., None, None, None].unbind(3)
-    return pupil[:, :, 0] * x + pupil[:, :, 1] * y
-
-
-def _pure_states(angle: Tensor, extinction: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Shares (state,) and Jones vectors (state, 2) whose projections add up to `leaky`."""
+def _pure_states(angle: Tensor, extinction: Tensor | None) -> PureStates:
+    """The pure states of a polariser, whose projections add up to `leaky`."""
     if extinction is None:
-        return torch.ones_like(angle)[None], linear(angle)[None]
+        return PureStates(torch.ones_like(angle)[None], linear(angle)[None])
     shares = torch.stack((torch.ones_like(extinction), extinction))
-    return shares, torch.stack((linear(angle), linear(angle + math.pi / 2)))
+    return PureStates(shares, torch.stack((linear(angle), linear(angle + math.pi / 2))))
 
 
 def _double(value: float | Tensor) -> Tensor:

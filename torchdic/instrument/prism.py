@@ -1,10 +1,11 @@
 """The Nomarski prism: two beams, displaced by the shear and out of phase by the bias.
 
-Given directly, by the polariser of de Sénarmont's compensator, or by its wedge. Two cemented wedges of angle ψ of a
-birefringent crystal, their optic axes crossed, give the beams, polarised along one axis and the other, the path
-differences ±(n_e − n_o)·x·tanψ about the line x = 0 where the wedges are equally thick, and so, to first order in the
-birefringence, the split angle ε = 2(n_e − n_o)·tanψ. Light of frequency f crosses the back focal plane at
-x = λ·f_obj·f, so that with a prism centred at ξ beam 1 leads by 2π·(ε/λ)·(λ f_obj f − ξ) = 2π f·s + bias:
+A prism is given by shear and bias, by the polariser of de Sénarmont's compensator, or by its wedges. Two wedges of
+angle ψ of a birefringent crystal are cemented with their optic axes crossed. The beams, each polarised along one of the
+axes, get the path differences ±(n_e − n_o)·x·tanψ, where x is counted from the line along which both wedges are equally
+thick. To first order in the birefringence this is the split angle ε = 2(n_e − n_o)·tanψ. Light of frequency f crosses
+the back focal plane at x = λ·f_obj·f. So with a prism centred at ξ beam 1 leads by
+2π·(ε/λ)·(λ f_obj f − ξ) = 2π f·s + bias:
     s = ε·f_obj,    bias = −2π s·ξ/(λ f_obj).
 
 G. Nomarski, J. Phys. Radium 16, 9S (1955); W. Lang, Zeiss Information 70, 114 (1968).
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from torchdic.scalar import number, scalar
 
-# Ordinary and extraordinary index at 546.1 nm: the dispersion equations of G. Ghosh, Opt. Commun. 163, 95 (1999).
+# Ordinary and extraordinary index at 546.1 nm, by the dispersion equations of G. Ghosh, Opt. Commun. 163, 95 (1999).
 MATERIALS = {"quartz": (1.54614, 1.55531), "calcite": (1.66160, 1.48765)}
 
 
@@ -28,11 +29,13 @@ MATERIALS = {"quartz": (1.54614, 1.55531), "calcite": (1.66160, 1.48765)}
 class Prism:
     """A Nomarski prism with its compensator.
 
-    shear: full displacement (y, x) in µm between the two beams. bias: phase in rad by which beam 1, which is displaced
-    by −shear/2 (so that it sees U(x + shear/2)), leads. Numbers or tensors; tensors are learned.
-    axis: rad from +x towards +y, along which beam 1 is polarised, beam 2 across it; None is the direction of the shear
-    (of a shear of exactly 0, +x). It matters where lenses tell polarisations apart, see `torchdic.jones_pupil`.
-    Raises ValueError where a value is not finite or the shear isn't a pair.
+    shear: full displacement (y, x) in µm between the two beams.
+    bias: phase in rad by which beam 1 leads. Beam 1 is displaced by −shear/2, so that it sees U(x + shear/2).
+    axis: angle in rad from +x towards +y along which beam 1 is polarised; beam 2 is polarised across it. None is the
+    direction of the shear, or +x for a shear of exactly 0. It matters only where lenses act on polarisation, see
+    `torchdic.instrument.polarised_lenses`.
+
+    Numbers or tensors; tensors are learned. Raises ValueError where a value is not finite or the shear isn't a pair.
     """
 
     shear: tuple[float | Tensor, float | Tensor] | Float[Tensor, " 2"]
@@ -58,10 +61,12 @@ class Prism:
         *,
         axis: float | Tensor | None = None,
     ) -> "Prism":
-        """A prism at its centre behind de Sénarmont's compensator: the bias is twice the polariser's angle.
+        """A centred prism behind de Sénarmont's compensator: the bias is twice the polariser's angle.
 
-        polariser: rad by which the polariser is turned from 45° to the prism's axes, its crossed position, towards
-        beam 2's axis, in front of a quarter-wave plate whose slow axis is at 45°.
+        shear: full displacement (y, x) in µm between the two beams.
+        polariser: angle in rad by which the polariser is turned from its crossed position, at 45° to the prism's axes,
+        towards beam 2's axis. Behind it stands a quarter-wave plate whose slow axis is at 45°.
+        axis: of beam 1's polarisation, see `Prism`.
         """
         return cls(shear, 2 * polariser, axis)
 
@@ -80,12 +85,18 @@ class Prism:
     ) -> "Prism":
         """The prism of two cemented wedges, see the module's docstring.
 
-        angle: ψ in rad of each wedge. focal_length: of the objective, f_tube/M, in µm. wavelength: in vacuum, µm.
-        material: its indices at 546 nm, or indices: (n_o, n_e), one of the two. offset: ξ in µm by which the prism is
-        displaced along `direction` (y, x), of any length, in which the wedge that is extraordinary for beam 1 grows
-        thicker. Numbers or 0-d tensors, which are learned. Raises ValueError for a wedge that isn't between −π/2 and
-        π/2, a focal length or wavelength that isn't positive, no direction, an unknown material, or not just one of
-        material and indices.
+        angle: ψ in rad of each wedge.
+        focal_length: of the objective, f_tube/M, in µm.
+        wavelength: in vacuum, µm.
+        material: the wedges' crystal, with its indices at 546 nm; or instead
+        indices: (n_o, n_e) of the crystal.
+        offset: ξ in µm by which the prism is displaced along `direction`.
+        direction: (y, x), of any length, in which the wedge that is extraordinary for beam 1 grows thicker.
+        axis: of beam 1's polarisation, see `Prism`.
+
+        Numbers or 0-d tensors; tensors are learned. Raises ValueError for a wedge angle that isn't between −π/2 and
+        π/2, a focal length or wavelength that isn't positive, a direction of length 0, an unknown material, and where
+        both or neither of material and indices are given.
         """
         if (material is None) == (indices is None):
             raise ValueError("a wedge needs either its material or its indices (n_o, n_e)")
@@ -108,19 +119,18 @@ class Prism:
         return cls((shear * (direction[0] / length), shear * (direction[1] / length)), bias, axis)
 
     def transfer(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
-        """sin(π f·s + bias/2): the two beams' interference behind a crossed analyser, but for a constant factor i.
+        """sin(π f·s + bias/2): interference of the two beams behind a crossed analyser, without a constant factor i.
 
-        It is taken at the envelope's frequency f, not at the field's f + f_s: the condenser prism at work, which
-        cancels the tilt's phase. Without a condenser prism it is taken at f + f_s, for each source.
+        frequencies: in 1/µm; the envelope's f if a condenser prism cancels the tilt's phase, else the field's f + f_s.
         """
         return torch.sin(self._half_difference(frequencies))
 
     def parallel(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
-        """cos(π f·s + bias/2): the two beams' interference behind a parallel analyser, what the crossed one stops."""
+        """cos(π f·s + bias/2): interference behind a parallel analyser; a crossed analyser stops this light."""
         return torch.cos(self._half_difference(frequencies))
 
     def shear_phase(self, frequencies: Float[Tensor, "*source 2 y x"]) -> Float[Tensor, "*source y x"]:
-        """π f·s, half the phase between the beams but for the bias."""
+        """π f·s: half the phase between the beams, without the bias. frequencies: in 1/µm."""
         y, x = self._shear(frequencies)
         return math.pi * (frequencies[..., 0, :, :] * y + frequencies[..., 1, :, :] * x)
 

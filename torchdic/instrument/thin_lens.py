@@ -3,16 +3,20 @@
 import math
 from dataclasses import dataclass
 
-# Relative difference up to which more lengths than the lens law needs count as agreeing.
+# Where more lengths are given than the lens law needs, they agree if they differ by no more than this, relatively.
 _AGREE = 1e-6
 
 
 @dataclass(frozen=True)
 class ThinLens:
-    """A thin lens that forms a real image: 1/f = 1/a + 1/b and M = b/a; `thin_lens` finds it from any two of them.
+    """A thin lens that forms a real image: 1/f = 1/a + 1/b and M = b/a; `thin_lens` finds it from any two of these.
 
-    focal_length f, object_distance a, image_distance b: µm. magnification M: of the image, which is inverted.
-    Raises ValueError where one isn't positive, or they break a law.
+    focal_length: f in µm.
+    object_distance: a in µm.
+    image_distance: b in µm.
+    magnification: M of the image, which is inverted.
+
+    Raises ValueError where one isn't positive, or they break one of the two laws.
     """
 
     focal_length: float
@@ -40,9 +44,9 @@ def thin_lens(
     image_distance: float | None = None,
     magnification: float | None = None,
 ) -> ThinLens:
-    """The thin lens of two or more of its lengths (µm) and magnification, by 1/f = 1/a + 1/b and M = b/a.
+    """The thin lens from two or more of its lengths (µm) and its magnification, by 1/f = 1/a + 1/b and M = b/a.
 
-    Raises ValueError for fewer than two, for lengths that form no real image, and for more that contradict each other.
+    Raises ValueError for fewer than two, lengths that form no real image, and values that contradict each other.
     """
     f, a, b, m = focal_length, object_distance, image_distance, magnification
     given = {"focal_length": f, "object_distance": a, "image_distance": b, "magnification": m}

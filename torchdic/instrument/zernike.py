@@ -1,4 +1,4 @@
-"""Zernike polynomials over the pupil, by Noll's index."""
+"""Zernike polynomials over the pupil, numbered by Noll's index."""
 
 import math
 
@@ -7,9 +7,11 @@ from torch import Tensor
 
 
 def zernike(noll: int, rho: Tensor, theta: Tensor) -> Tensor:
-    """The Zernike polynomial of a Noll index, of unit rms over the disc ρ ≤ 1; θ is counted from +x towards +y.
+    """The Zernike polynomial of a Noll index, of unit rms over the disc ρ ≤ 1.
 
-    Noll, J. Opt. Soc. Am. 66, 207 (1976).
+    noll: index from 1. rho: distance from the axis, in units of the radius. theta: rad from +x towards +y.
+
+    R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976).
     """
     n = (math.isqrt(8 * noll - 7) - 1) // 2
     place = noll - n * (n + 1) // 2

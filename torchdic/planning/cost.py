@@ -29,9 +29,11 @@ def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition
     grid = volume.grid.widened(fidelity.padding, fidelity.padding)
     pixels = math.prod(grid.shape[1:])
     inside = propagation_of(fidelity).work(grid, fidelity, absorbs=volume.absorption is not None)
-    polarisation, states = microscope.polarisation, 0
-    if polarisation is not None and not polarisation.ideal:
-        states = polarisation.states if microscope.vectorial else 1
+    polarisers = microscope.polarisers
+    if microscope.lenses is not None:
+        states = 1 if polarisers is None else polarisers.states
+    else:
+        states = 0 if polarisers is None else 1
     images = len(acquisition.prisms) * len(acquisition.focus) * (IMAGE + POLARISED * states)
     sources = len(microscope.colours()) * directions(microscope, fidelity.sources)
     return sources * (SETUP + inside + images) * pixels * math.log2(max(pixels, 2))
