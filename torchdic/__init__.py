@@ -28,6 +28,8 @@ from torchdic.planning.work_precision import Candidate, Trial, work_precision
 from torchdic.rays.trace import Rays, launch, trace
 from torchdic.specimen.volume import Volume
 
+__version__ = "0.1.0"
+
 __all__ = [
     "DRAFT",
     "REFERENCE",
