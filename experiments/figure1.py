@@ -18,7 +18,7 @@ from torch import Tensor
 
 from data_synthetic import Bead
 from recon.report import figures
-from recon.run.exact_images import MARGIN, exact_images
+from recon.run.exact_images import WIDENING, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BEAD = Bead(radius=5.0, contrast=0.03, background=1.56)
@@ -43,8 +43,8 @@ def main() -> int:
 @torch.no_grad()
 def stacks() -> tuple[Float[Tensor, "focus y x"], Float[Tensor, "focus y x"]]:
     """The images by the wave, and those of the exact field."""
-    # the exact field's array is wider by MARGIN a side
-    fidelity = Fidelity("wave", sources=SOURCES, padding=round(MARGIN * GRID.shape[1]))
+    # padded as widely as the array of the exact field
+    fidelity = Fidelity("wave", sources=SOURCES, padding=round(WIDENING * GRID.shape[1]))
     volume = Volume(GRID, BEAD.delta(GRID, dtype=torch.float32), BEAD.background)
     modelled = image(volume, MICROSCOPE, ACQUISITION, fidelity)
     exact = exact_images(BEAD, GRID, MICROSCOPE, ACQUISITION, fidelity)

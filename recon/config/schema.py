@@ -157,7 +157,7 @@ class Config:
     fidelity: how carefully to compute; None lets the command choose.
     reconstruction, simulation, work_precision: how the commands of these names work.
     specimen: the kind and the measures of a known specimen, which `recon.cli` makes of it; None where there is none.
-    tolerance: the error that images may have, for which a fidelity is planned (see `torchdic.plan`); None plans nothing.
+    tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
         `torchdic.planning.work_precision.ladder`.
     Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
