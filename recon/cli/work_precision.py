@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _references(config: Config, candidates: Sequence[Candidate]) -> dict[str, Fidelity]:
     """For each propagation the fidelity whose result counts as converged: the configuration's, or the usual one."""
-    reference: dict[str, Fidelity] = {**converged_fidelities(candidates, config.volume.grid)}
+    reference: dict[str, Fidelity] = converged_fidelities(candidates, config.volume.grid)
     given = config.work_precision.reference
     if given is None:
         return reference

@@ -175,17 +175,14 @@ def _by_noll_index(hook: Hook, words: str) -> Hook:
 
 
 def _prism(value: Any, _: Any) -> Prism | None:
-    """A prism by its shear and bias, by de Sénarmont's polariser or by its wedge; or bright field by its name."""
+    """A prism, given by its shear and bias or as one of PRISMS, or bright field by its name."""
     if value == BRIGHT_FIELD:
         return None
     if not isinstance(value, dict):
         raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
-    if "polariser" in value:
-        compensator = converter.structure(value, CompensatorSection)
-        return Prism.senarmont(compensator.shear, compensator.polariser, axis=compensator.axis)
-    if "wedge" in value:
-        given = vars(converter.structure(value, WedgeSection))
-        return Prism.from_wedge(given["wedge"], **{key: v for key, v in given.items() if key != "wedge"})
+    for key, section in PRISMS.items():
+        if key in value:
+            return converter.structure(value, section).prism()
     return converter.structure(value, Prism)
 
 
@@ -214,6 +211,9 @@ KINDS: tuple[tuple[Callable[[Any], bool], Hook], ...] = (
     (_has_fixed_length, _array_of_fixed_length),
     (_is_optional, _optional),
 )
+
+# The key that only one kind of prism has, and the section that reads it.
+PRISMS = {"polariser": CompensatorSection, "wedge": WedgeSection}
 
 # Fields whose type allows more than a file may say (a tensor, any sequence), and their hooks.
 FIELDS: dict[type, dict[str, Hook]] = {

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from recon.fit.descent import Recipe
-from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope
+from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope, Prism
 from torchdic.instrument.microscope import check_apertures
 
 
@@ -56,6 +56,10 @@ class CompensatorSection:
     polariser: float
     axis: float | None = None
 
+    def prism(self) -> Prism:
+        """The prism with the bias that the polariser gives it."""
+        return Prism.senarmont(self.shear, self.polariser, axis=self.axis)
+
 
 @dataclass(frozen=True)
 class WedgeSection:
@@ -73,6 +77,11 @@ class WedgeSection:
     offset: float = 0.0
     direction: tuple[float, float] = (0.0, 1.0)
     axis: float | None = None
+
+    def prism(self) -> Prism:
+        """The prism with the shear and bias that the wedge gives it."""
+        others = {name: value for name, value in vars(self).items() if name != "wedge"}
+        return Prism.from_wedge(self.wedge, **others)
 
 
 @dataclass(frozen=True)
