@@ -403,12 +403,13 @@ def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkey
 
 
 @pytest.mark.parametrize(
-    ("free", "wanted"), [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")]
+    "room", [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
 )
 @pytest.mark.parametrize("start", ["linear", "zero"])
 def test_a_reconstruction_without_room_is_refused_before_it_begins(
-    write, run, refused, monkeypatch, tmp_path, start, free, wanted
+    write, run, refused, monkeypatch, tmp_path, start, room
 ):
+    free, wanted = room
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())

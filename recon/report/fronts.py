@@ -122,7 +122,7 @@ def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str]
     grid = figure.subplots(len(rows), 2, squeeze=False, sharex="row", sharey="row")
     marks = marks_of(t.candidate.fidelity.propagation for trials in scenes.values() for t in trials)
     for (scene, quantity), axes in zip(rows, grid, strict=True):
-        _draw_row(axes, scene, scenes[scene], quantity, marks)
+        _draw_row(list(axes), scene, scenes[scene], quantity, marks)
     handles = _legend_handles(grid[0, 0], marks)
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
     figure.draw_without_rendering()  # lays the axes out
