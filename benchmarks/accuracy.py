@@ -4,7 +4,7 @@
 
 Objective NA 0.9, condenser NA 0.7, 546 nm, shear 0.24 µm along x, bias π/2, float32 unless a candidate says otherwise.
 The truth is an exact field where there is one, otherwise the converged wave. Errors are defined in
-`torchdic.precision`; its ladder of candidates is tried, and the presets.
+`torchdic.planning.work_precision`; its ladder of candidates is tried, and the presets.
 """
 
 import argparse

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from comparison import header, row, trial
 from data_synthetic import Bead, GaussianBall
-from recon.run.exact_images import MARGIN, exact_images
+from recon.run.exact_images import WIDENING, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume
 from torchdic.errors import TurnedRaysError
 
@@ -49,7 +49,7 @@ class Case:
     @property
     def padding(self) -> int:
         """Voxels a side that make the model's array the exact one's."""
-        return round(MARGIN * self.grid.shape[1])
+        return round(WIDENING * self.grid.shape[1])
 
 
 CASES = {

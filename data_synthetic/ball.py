@@ -1,4 +1,4 @@
-"""A Gaussian ball: smooth everywhere, so that ray models can be held to their best."""
+"""A Gaussian ball. It is smooth everywhere, so that it shows how good a ray model can be."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from data_synthetic.exact import radial_field
+from data_synthetic.exact.fields import radial_field
 from data_synthetic.specimen import (
     Specimen,
     centres,
@@ -22,9 +22,13 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class GaussianBall(Specimen):
-    """Δn = contrast·exp(−r²/2σ²) about a centre: sigma in µm, centre (z, y, x) in µm.
+    """A ball of Δn = contrast·exp(−r²/2σ²), where r is the distance from its centre.
 
-    A voxel holds Δn at its centre. Raises ValueError for a sigma not above 0 and for an index below 1.
+    sigma: σ in µm.
+    contrast: Δn at the centre.
+    background: index of the medium.
+    centre: (z, y, x) in µm.
+    A voxel holds the Δn of its centre. Raises ValueError for a sigma not above 0 and for an index below 1.
     """
 
     sigma: float
@@ -50,12 +54,15 @@ class GaussianBall(Specimen):
         start: float = -math.inf,
         end: float = math.inf,
     ) -> Float[Tensor, "*ray"]:
-        """∫Δn ds in µm, shape (...), along straight rays of any direction, between z = start and z = end.
+        """The OPD ∫Δn ds in µm, shape (...), along straight rays of any direction.
 
-        position (..., 2): where a ray crosses z = plane, in µm; momentum (..., 2): its n·(transverse
-        direction) in the background. With b the ray's distance from the centre and s the path from the
-        closest point: contrast·σ·√(π/2)·exp(−b²/2σ²)·[erf(s_end/σ√2) − erf(s_start/σ√2)]. Raises
-        ValueError for a momentum not below the background index.
+        position: where each ray crosses z = plane, (..., 2), (y, x) in µm.
+        momentum: n·(transverse direction) of each ray in the background, (..., 2), (y, x).
+        plane: z in µm.
+        start, end: z in µm between which the OPD is counted.
+        With b the ray's distance from the centre and s the path from the point closest to it, the OPD is
+        contrast·σ·√(π/2)·exp(−b²/2σ²)·[erf(s_end/σ√2) − erf(s_start/σ√2)].
+        Raises ValueError for a momentum not below the background index.
         """
         position, momentum = position.to(torch.float64), momentum.to(torch.float64)
         pz = require_propagating(momentum, self.background)
@@ -73,7 +80,7 @@ class GaussianBall(Specimen):
 
     @property
     def reach(self) -> float:
-        """The distance in µm from the centre where Δn has fallen to double precision's rounding of n."""
+        """The distance in µm from the centre beyond which Δn is lost in the rounding of n in double precision."""
         fall = abs(self.contrast) / (np.finfo(np.float64).eps * self.background)
         return self.sigma * math.sqrt(2 * math.log(max(fall, math.e)))
 
@@ -87,7 +94,7 @@ class GaussianBall(Specimen):
         padding: float = 2.0,
         na: float | None = None,
     ) -> Complex[Tensor, "source y x"]:
-        """The exact field behind this ball as envelopes (source, y, x); arguments as of `radial_field`."""
+        """The exact field behind this ball as envelopes (source, y, x); the arguments are those of `radial_field`."""
 
         def index(r: np.ndarray) -> np.ndarray:
             return self.background + self.contrast * np.exp(-(r**2) / (2 * self.sigma**2))

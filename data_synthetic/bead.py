@@ -1,4 +1,4 @@
-"""The paper's manufactured specimen: a bead in optical cement."""
+"""A bead, such as the one in optical cement that the paper manufactured."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from data_synthetic.ellipsoid import Ellipsoid
-from data_synthetic.exact import sphere_field
+from data_synthetic.exact.fields import sphere_field
 from data_synthetic.fill import require_subpixels
 from data_synthetic.specimen import Specimen, require_above_zero, require_contrast, require_vector
 from torchdic.grid import Grid
@@ -14,9 +14,13 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class Bead(Specimen):
-    """A homogeneous sphere of index background + contrast, each voxel filled by its covered volume.
+    """A homogeneous sphere of index background + contrast.
 
-    radius in µm; centre (z, y, x) in µm; subpixels: columns per voxel and transverse axis (analytic along z).
+    radius: in µm.
+    contrast: Δn inside.
+    background: index of the medium.
+    centre: (z, y, x) in µm.
+    subpixels: columns per voxel along y and along x, by which each voxel's covered volume is found.
     Raises ValueError for a radius not above 0 and for an index below 1.
     """
 
@@ -46,7 +50,7 @@ class Bead(Specimen):
         padding: float = 2.0,
         na: float | None = None,
     ) -> Complex[Tensor, "source y x"]:
-        """The exact field behind this bead as envelopes (source, y, x); arguments as of `sphere_field`."""
+        """The exact field behind this bead as envelopes (source, y, x); the arguments are those of `sphere_field`."""
         return sphere_field(
             grid,
             wavelength,

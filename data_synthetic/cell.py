@@ -1,4 +1,4 @@
-"""A cell with organelles, asymmetric in every axis so that a swapped axis or sign shows."""
+"""A cell with organelles. It is asymmetric along every axis, so that a swapped axis or sign shows in its image."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,11 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class Organelle:
-    """A homogeneous part of a cell: its shape, and its Δn from the medium around the cell."""
+    """A homogeneous part of a cell.
+
+    shape: where it is.
+    contrast: its index minus that of the medium around the cell.
+    """
 
     shape: Ellipsoid
     contrast: float
@@ -21,11 +25,16 @@ class Organelle:
 
 @dataclass(frozen=True)
 class CellPhantom(Specimen):
-    """Cytoplasm with a nucleus, nucleoli in it, a vacuole and a lipid droplet; a part may be None or ().
+    """Cytoplasm with a nucleus, nucleoli in the nucleus, a vacuole and a lipid droplet.
 
-    The default is 5.2 × 6.4 × 8.4 µm (z, y, x) in a medium of 1.335. Every contrast is n − background. Each
-    voxel is filled by its covered volume, subpixels as for a bead. Raises ValueError for an index below
-    1, for a part that sticks out of the one it lies in, and for parts that overlap.
+    The default cell is 5.2 × 6.4 × 8.4 µm (z, y, x) in a medium of 1.335.
+
+    background: index of the medium.
+    cytoplasm: the whole cell.
+    nucleus, vacuole, lipid: parts in the cytoplasm; None leaves one out.
+    nucleoli: parts in the nucleus; () leaves them out.
+    subpixels: columns per voxel along y and along x, by which each voxel's covered volume is found.
+    Raises ValueError for an index below 1, a part that sticks out of the one it lies in, and parts that overlap.
     """
 
     background: float = 1.335
@@ -57,7 +66,7 @@ class CellPhantom(Specimen):
                     raise ValueError(f"{name} and {other_name} overlap, but a voxel has one index")
 
     def _parts(self) -> list[tuple[str, Organelle, Organelle]]:
-        """(name, part, the part that it lies in) of everything inside the cytoplasm."""
+        """Each part inside the cytoplasm as (name, part, the part that it lies in)."""
         inside = [("nucleus", self.nucleus), ("vacuole", self.vacuole), ("lipid", self.lipid)]
         parts = [(name, part, self.cytoplasm) for name, part in inside if part is not None]
         if self.nucleoli and self.nucleus is None:
@@ -67,7 +76,7 @@ class CellPhantom(Specimen):
         return parts
 
     def _delta(self, grid: Grid) -> Float[Tensor, "z y x"]:
-        # A part replaces what its host has there; parts lie wholly inside their hosts, so the sum is exact.
+        # A part replaces the index of its host. Parts lie wholly inside their hosts, so the sum is exact.
         delta = self.cytoplasm.contrast * self.cytoplasm.shape.fill(grid, self.subpixels)
         for _, part, host in self._parts():
             delta += (part.contrast - host.contrast) * part.shape.fill(grid, self.subpixels)

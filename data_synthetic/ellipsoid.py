@@ -1,4 +1,4 @@
-"""The shape of beads and organelles."""
+"""Ellipsoids, the shape of beads and organelles."""
 
 import math
 from dataclasses import dataclass
@@ -14,8 +14,10 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid with its axes along (z, y, x): semi_axes and centre (z, y, x) in µm.
+    """An ellipsoid whose axes lie along z, y and x.
 
+    semi_axes: (z, y, x) in µm.
+    centre: (z, y, x) in µm.
     Raises ValueError for a semi-axis not above 0 or a centre that is not finite.
     """
 
@@ -30,11 +32,11 @@ class Ellipsoid:
 
     @property
     def volume(self) -> float:
-        """4π/3 times the product of the semi-axes, in µm³."""
+        """Its volume in µm³: 4π/3 times the product of the semi-axes."""
         return 4 / 3 * math.pi * math.prod(self.semi_axes)
 
     def fill(self, grid: Grid, subpixels: int = 4) -> Float[Tensor, "z y x"]:
-        """The covered volume fraction of each voxel, shape (z, y, x), float64; see `covered_fraction`."""
+        """The fraction of each voxel that it covers, shape (z, y, x), float64; see `covered_fraction`."""
         require_subpixels(subpixels)
         (az, ay, ax), (cz, cy, cx) = self.semi_axes, self.centre
 

@@ -1,8 +1,8 @@
-"""Glass with a surface etched in two levels under a mounting medium: what step and grating share."""
+"""Glass etched in two levels under a mounting medium: a step, as the paper manufactured it, and a grating."""
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -21,15 +21,21 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class EtchedGlass(Specimen):
-    """Glass below a mounting medium, its surface at two levels `height` apart along `direction`.
+    """Glass below a mounting medium. The surface of the glass has two levels, which alternate along a direction.
 
-    Light travels toward +z, from the glass into the medium. The background is the medium, because that is
-    where the light leaves to the objective; the glass is Δn = glass − background. height, and the z halfway
-    between the levels `surface`, in µm; direction: a transverse vector (y, x) of any length. edge: 0 is a
-    vertical wall, above 0 a smooth one, z = surface + (height/2)·tanh(d/edge) with d the distance from the
-    nearest wall, above 0 on the higher side. Voxels are filled by their covered volume, which places a
-    vertical wall to 1/(2·subpixels) of a voxel. Raises ValueError for an index below 1, a direction of
-    length 0 or a negative edge.
+    Light travels toward +z, from the glass into the medium and on to the objective. So the background is the medium,
+    and the glass has Δn = glass − background.
+
+    height: of the higher level above the lower one, in µm.
+    glass, background: refractive indices of the glass and of the medium.
+    direction: transverse vector (y, x) of any length, across the walls.
+    offset: place of the first wall in µm along the direction.
+    surface: z in µm halfway between the levels.
+    edge: width of a wall in µm. At 0 it is vertical; above 0 it is smooth, z = surface + (height/2)·tanh(d/edge), where
+        d is the distance from the nearest wall, above 0 on the higher side.
+    subpixels: columns per voxel along y and along x. Each voxel is filled by its covered volume, so that a vertical
+        wall is placed to 1/(2·subpixels) of a voxel.
+    Raises ValueError for an index below 1, a direction of length 0 or a negative edge.
     """
 
     height: float
@@ -54,15 +60,15 @@ class EtchedGlass(Specimen):
 
     @property
     def opd_step(self) -> float:
-        """How much the OPD of axial light rises from the lower level to the higher one, in µm.
-
-        height·(glass − background): above 0 where the higher side has more of the denser glass.
-        """
+        """The OPD of axial light at the higher level minus that at the lower, in µm: height·(glass − background)."""
         return self.height * (self.glass - self.background)
 
     @abstractmethod
     def from_wall(self, u: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
-        """Distance in µm from the nearest wall, above 0 on the higher side; u: µm along `direction` from `offset`."""
+        """The distance in µm from the nearest wall, above 0 on the higher side.
+
+        u: place in µm along the direction, counted from `offset`.
+        """
 
     def surface_height(self, y: Float[Tensor, "*point"], x: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
         """The z in µm of the glass surface at (y, x) in µm."""
@@ -76,3 +82,43 @@ class EtchedGlass(Specimen):
             return torch.full_like(upper, -grid.extent[0] / 2).minimum(upper), upper
 
         return (self.glass - self.background) * covered_fraction(grid, surfaces, self.subpixels)
+
+
+@dataclass(frozen=True)
+class EtchedGlassStep(EtchedGlass):
+    """Glass whose surface is higher on the side that the direction points to; see `EtchedGlass`.
+
+    The wall stands `offset` µm along the direction. A negative height is a step down.
+    """
+
+    def from_wall(self, u: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+        """The distance from the only wall, which is u itself."""
+        return u
+
+
+@dataclass(frozen=True)
+class EtchedGlassGrating(EtchedGlass):
+    """Glass with one ridge in each period along the direction; see `EtchedGlass`.
+
+    A ridge begins `offset` µm along the direction. A negative height makes grooves of the ridges.
+
+    period: in µm.
+    duty: width of a ridge, as a fraction of the period.
+    Raises ValueError also for a period not above 0 and a duty not between 0 and 1.
+    """
+
+    period: float = field(kw_only=True)
+    duty: float = field(default=0.5, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_above_zero("period", self.period, "µm")
+        require_finite("duty", self.duty, "")
+        if not 0 < self.duty < 1:
+            raise ValueError(f"duty {self.duty} must lie between 0 and 1")
+
+    def from_wall(self, u: Float[Tensor, "*point"]) -> Float[Tensor, "*point"]:
+        """Half a ridge's width minus the distance from the middle of the nearest ridge."""
+        half = self.duty * self.period / 2
+        from_middle = torch.remainder(u - half + self.period / 2, self.period) - self.period / 2
+        return half - from_middle.abs()

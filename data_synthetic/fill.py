@@ -1,4 +1,4 @@
-"""How much of each voxel a solid covers: the anti-aliasing that all sharp-edged specimens share."""
+"""The fraction of each voxel that a solid covers: all specimens with sharp edges fill their voxels by it."""
 
 from collections.abc import Callable
 
@@ -12,13 +12,14 @@ Surfaces = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def covered_fraction(grid: Grid, surfaces: Surfaces, subpixels: int) -> Float[Tensor, "z y x"]:
-    """The volume fraction of each voxel between two surfaces, shape (z, y, x), float64, from 0 to 1.
+    """The fraction of each voxel between two surfaces, shape (z, y, x), float64, from 0 to 1.
 
-    surfaces: a function of (y, x) in µm, arrays of one shape, to the solid's (lower, upper) z in µm of that
-    shape; a solid that misses a column has lower = upper there. subpixels: columns per voxel along y and
-    along x. Along z the cover of each column is exact; transversally it is the mean over subpixels²
-    columns. Voxels filled all or nothing would move a sphere's edge by half a voxel, which its DIC image
-    shows.
+    grid: the voxels.
+    surfaces: a function that takes y and x in µm, two arrays of one shape, and gives the solid's lower and upper z in
+        µm in arrays of that shape; where the solid misses a column, both are equal.
+    subpixels: columns per voxel along y and along x.
+    The covered length of each column is exact, and a voxel's fraction is the mean over its subpixels² columns. Voxels
+    that are wholly filled or empty would move a sphere's edge by up to half a voxel, and the DIC image would show that.
     """
     faces = torch.arange(grid.shape[0] + 1, dtype=torch.float64) - grid.shape[0] / 2
     faces = (faces * grid.spacing[0])[:, None]

@@ -1,4 +1,4 @@
-"""A medium whose index varies along the optical axis only: the test of Snell's law."""
+"""A medium whose index varies along the optical axis only, to test Snell's law."""
 
 import math
 from dataclasses import dataclass
@@ -22,12 +22,16 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class LayeredMedium(Specimen):
-    """A layer of index background + contrast with smooth faces, perpendicular to z.
+    """A layer of index background + contrast, perpendicular to z, with smooth faces.
 
-    Δn(z) = (contrast/2)·[tanh((z − bottom)/edge) − tanh((z − bottom − thickness)/edge)], bottom,
-    thickness and edge in µm; thickness may be infinite: one smooth face, from the background to
-    background + contrast. A voxel holds Δn at its centre. Raises ValueError for a thickness or edge not
-    above 0 and for an index below 1.
+    Δn(z) = (contrast/2)·[tanh((z − bottom)/edge) − tanh((z − bottom − thickness)/edge)].
+
+    contrast: Δn within the layer.
+    background: index of the medium.
+    bottom: z of the first face in µm.
+    thickness: in µm; an infinite one leaves the first face alone.
+    edge: half the width in µm over which the index changes at a face.
+    A voxel holds the Δn of its centre. Raises ValueError for a thickness or edge not above 0 and for an index below 1.
     """
 
     contrast: float
@@ -58,7 +62,11 @@ class LayeredMedium(Specimen):
         start: float,
         end: float,
     ) -> ExactRays:
-        """Rays at z = end that were at position (..., 2) with momentum (..., 2) at z = start, all in µm.
+        """Trace rays exactly from z = start to z = end.
+
+        position: (..., 2), (y, x) in µm, at the start.
+        momentum: n·(transverse direction), (..., 2), (y, x), at the start.
+        start, end: z in µm.
 
         n does not depend on (y, x), so p is conserved (Snell's law); with p_z(z) = √(n(z)² − |p|²) and
         B = n² − n0²,  x = x0 + p·∫dz/p_z  and  W = ∫(p_z − p_z0) dz = ∫B/(p_z + p_z0) dz, by adaptive
@@ -85,7 +93,7 @@ class LayeredMedium(Specimen):
             pz, bending = axial(z)
             return bending / (pz + pz0)
 
-        # The faces are where the integrand changes; telling quad keeps its error estimate honest.
+        # The integrand changes fast at the faces. quad's estimate of its error is right only if it knows them.
         low, high = min(start, end), max(start, end)
         faces = [z for z in (self.bottom, self.bottom + self.thickness) if low < z < high] or None
         tolerance = {"epsabs": 1e-12, "epsrel": 1e-12, "limit": 400, "points": faces}

@@ -1,4 +1,4 @@
-"""A graded-index rod, whose rays are harmonic oscillations: the test of an integrator's order."""
+"""A graded-index rod. Its rays are harmonic oscillations, by which the order of an integrator is tested."""
 
 import math
 from dataclasses import dataclass
@@ -21,10 +21,13 @@ from torchdic.grid import Grid
 
 @dataclass(frozen=True)
 class GradedIndexRod(Specimen):
-    """A rod along z with n² = n0²·(1 − α²r²), r the distance from its axis; the background n0 is on the axis.
+    """A rod along z with n² = n0²·(1 − α²r²), where r is the distance from its axis.
 
-    alpha in 1/µm; axis: the rod's (y, x) in µm. Δn is 0 on the axis and negative elsewhere. Raises ValueError
-    for an alpha not above 0, an n0 below 1, and a grid so wide that n would fall below 1 in it.
+    alpha: α in 1/µm.
+    background: n0, the index on the axis.
+    axis: place of the axis, (y, x) in µm.
+    Δn is 0 on the axis and negative elsewhere. Raises ValueError for an alpha not above 0 and an n0 below 1; `delta`
+    raises it for a grid so wide that n would fall below 1 in it.
     """
 
     alpha: float
@@ -56,7 +59,11 @@ class GradedIndexRod(Specimen):
         start: float,
         end: float,
     ) -> ExactRays:
-        """Rays at z = end that were at position (..., 2) with momentum (..., 2) at z = start, all in µm.
+        """Trace rays exactly from z = start to z = end.
+
+        position: (..., 2), (y, x) in µm, at the start.
+        momentum: n·(transverse direction), (..., 2), (y, x), at the start.
+        start, end: z in µm.
 
         n does not depend on z, so p_z = √(n(x0)² − |p0|²) is conserved and dp/dz = ½∇n²/p_z gives
         x'' = −ω²x with ω = n0·α/p_z (x from the axis):

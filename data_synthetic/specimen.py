@@ -1,4 +1,4 @@
-"""What every specimen is: a background index and an index difference on any grid."""
+"""The base of every specimen: a background index, and Δn on any grid."""
 
 import math
 from abc import ABC, abstractmethod
@@ -13,10 +13,11 @@ from torchdic.grid import Grid
 
 
 class ExactRays(NamedTuple):
-    """Rays after an exactly solved specimen: position (..., 2) in µm, momentum (..., 2), opd (...) in µm.
+    """Rays behind a specimen whose ray equation has an exact solution.
 
-    Vectors are (y, x). momentum is n·(transverse direction). opd is W, the difference from each ray's own
-    unperturbed plane wave of its entrance momentum in the background.
+    position: (..., 2), (y, x) in µm.
+    momentum: n·(transverse direction), (..., 2), (y, x).
+    opd: W in µm, (...), the difference of the optical path from that of the plane wave with which the ray began.
     """
 
     position: Float[Tensor, "*ray 2"]
@@ -25,13 +26,13 @@ class ExactRays(NamedTuple):
 
 
 class Specimen(ABC):
-    """A specimen of known index n = background + Δn; it is frozen, and its units are µm."""
+    """A specimen of known index n = background + Δn. Subclasses are frozen dataclasses, with lengths in µm."""
 
     background: float
 
     @abstractmethod
     def _delta(self, grid: Grid) -> Float[Tensor, "z y x"]:
-        """Δn on the grid in float64 on the CPU: every specimen is computed so and converted once."""
+        """Δn on the grid, shape (z, y, x), float64, on the CPU; `delta` and `index` convert it."""
 
     def delta(
         self, grid: Grid, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None

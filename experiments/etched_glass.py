@@ -2,10 +2,10 @@
 
     python experiments/etched_glass.py --out DIR
 
-Each is shown for a shear across its walls and one along them, and a profile at two biases is held against the law of a
-thin phase step without a lens: where the phase differs by φ between the two beams, I = sin²((bias ± φ)/2), over the
-width of the shear at each wall, and sin²(bias/2) elsewhere. The lens rounds that off over about λ/(NA_o + NA_c).
-Prints the largest difference between the wave's image and the same law seen through the lens, and leaves
+Each is shown for a shear across its walls and for one along them. Profiles at two biases stand beside the law of a thin
+phase step without a lens. Where the phase differs by φ between the two beams, which is over the width of the shear at
+each wall, I = sin²((bias ± φ)/2); elsewhere I = sin²(bias/2). The lens blurs this over about λ/(NA_o + NA_c). The
+script prints the largest difference between the wave's image and the same law seen through the lens, and leaves
 DIR/etched_glass.png.
 """
 
@@ -28,13 +28,13 @@ GRID = Grid((16, 128, 128), (0.025, 0.125, 0.125))
 BACKGROUND = 1.333  # water
 GLASS = 1.46
 HEIGHT = 0.3  # µm
-SHEAR = 0.25  # two pixels, so that the beams' pixels are whole ones
+SHEAR = 0.25  # two pixels, so that half a shear is a whole pixel
 BIASES = (math.pi / 2, math.pi / 6)
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.3))
 ACQUISITION = Acquisition(
     [Prism(shear, bias) for shear in ((0.0, SHEAR), (SHEAR, 0.0)) for bias in BIASES],
 )
-# the array is periodic: the step's other wall is that of its sides, at ±8 µm
+# the array is periodic, so that the step has a second wall at the array's sides, at ±8 µm
 SPECIMENS: dict[str, EtchedGlass] = {
     "step": EtchedGlassStep(HEIGHT, GLASS, BACKGROUND),
     "grating": EtchedGlassGrating(HEIGHT, GLASS, BACKGROUND, period=4.0, duty=0.375),
@@ -56,19 +56,19 @@ def main() -> int:
 
 @torch.no_grad()
 def modelled(specimen: EtchedGlass) -> Float[Tensor, "prism focus y x"]:
-    """The wave's images of the etched volume."""
+    """The images of the etched volume by the wave."""
     return image(Volume(GRID, specimen.delta(GRID), BACKGROUND), MICROSCOPE, ACQUISITION, Fidelity("wave"))
 
 
 def phase(specimen: EtchedGlass) -> Float[Tensor, "y x"]:
-    """The phase in rad of axial light, 2π/λ·OPD, as of a thin object."""
+    """The phase in rad that axial light gets if the object is thin: 2π/λ·OPD."""
     opd = specimen.delta(GRID).sum(0) * GRID.spacing[0]
     return 2 * math.pi / MICROSCOPE.wavelength * opd
 
 
 @torch.no_grad()
 def thin(specimen: EtchedGlass) -> Float[Tensor, "prism focus y x"]:
-    """Images of the same phase as a thin transmission through the same lens: what depth and obliquity leave out."""
+    """The images of the same phase as a thin transmission through the same lens, without depth and oblique paths."""
     transmission = torch.polar(torch.ones_like(phase(specimen)), phase(specimen))
     return image_field(transmission, GRID, MICROSCOPE, ACQUISITION, background=BACKGROUND)
 
@@ -85,7 +85,7 @@ def law(specimen: EtchedGlass) -> Float[Tensor, "prism y x"]:
 
 
 def draw(images: dict[str, Tensor], laws: dict[str, tuple[Tensor, Tensor]]) -> Figure:
-    """A row for each specimen: images for both shears at the first bias, and profiles across the walls."""
+    """Draw a row for each specimen: images for both shears at the first bias, and profiles across the walls."""
     width = GRID.extent[2]
     figure = Figure(figsize=(11, 6.2), layout="constrained")
     axes = figure.subplots(len(images), 3, width_ratios=(1, 1, 1.7), squeeze=False)

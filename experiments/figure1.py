@@ -1,10 +1,11 @@
-"""The bead of Kagalwala & Kanade's Figure 1 in focus and twice out of it: by the wave model, and by its exact field.
+"""The bead of Kagalwala & Kanade's Figure 1 at three focus planes, by the wave model and by its exact field.
 
     python experiments/figure1.py --out DIR
 
-A polystyrene bead, 10 µm across, of index 1.59 in optical cement of 1.56, in DIC at 546 nm. The exact field is a sum of
-partial waves in which none of our propagations has a part; its images use the same condenser directions and the same
-array. Prints the rms difference over the exact image's standard deviation, and leaves DIR/figure1.png.
+A polystyrene bead, 10 µm across, of index 1.59 in optical cement of 1.56, in DIC at 546 nm: in focus, and at two planes
+out of focus. The exact field is a sum of partial waves, in which none of torchdic's propagations takes part. Its images
+use the same condenser directions and the same array as the model's. The script prints the rms difference over the exact
+image's standard deviation for each plane, and leaves DIR/figure1.png.
 """
 
 import argparse
@@ -18,14 +19,14 @@ from torch import Tensor
 
 from data_synthetic import Bead
 from recon.report import figures
-from recon.run.exact_images import MARGIN, exact_images
+from recon.run.exact_images import WIDENING, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BEAD = Bead(radius=5.0, contrast=0.03, background=1.56)
 GRID = Grid((160, 128, 128), (0.0625, 0.15, 0.15))
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.7))
 ACQUISITION = Acquisition([Prism((0.0, 0.24), math.pi / 2)], (0.0, 4.0, 8.0))
-SOURCES = 80  # fewer show as speckle out of focus
+SOURCES = 80  # with fewer, images out of focus are speckled
 
 
 def main() -> int:
@@ -42,9 +43,9 @@ def main() -> int:
 
 @torch.no_grad()
 def stacks() -> tuple[Float[Tensor, "focus y x"], Float[Tensor, "focus y x"]]:
-    """The images by the wave, and those of the exact field."""
-    # the exact field's array is wider by MARGIN a side
-    fidelity = Fidelity("wave", sources=SOURCES, padding=round(MARGIN * GRID.shape[1]))
+    """The images by the wave, and those from the exact field."""
+    # padded as widely as the array of the exact field
+    fidelity = Fidelity("wave", sources=SOURCES, padding=round(WIDENING * GRID.shape[1]))
     volume = Volume(GRID, BEAD.delta(GRID, dtype=torch.float32), BEAD.background)
     modelled = image(volume, MICROSCOPE, ACQUISITION, fidelity)
     exact = exact_images(BEAD, GRID, MICROSCOPE, ACQUISITION, fidelity)
@@ -52,9 +53,9 @@ def stacks() -> tuple[Float[Tensor, "focus y x"], Float[Tensor, "focus y x"]]:
 
 
 def draw(modelled: Float[Tensor, "focus y x"], exact: Float[Tensor, "focus y x"], errors: list[float]) -> Figure:
-    """A row for each focus plane: the model's image, the exact one, their difference."""
+    """Draw a row for each focus plane: the model's image, the exact one, and their difference."""
     _, height, width = GRID.extent
-    box = (-width / 2, width / 2, height / 2, -height / 2)  # rows run down the picture
+    box = (-width / 2, width / 2, height / 2, -height / 2)  # row numbers grow downward
     low, high = float(exact.min()), float(exact.max())
     difference = modelled - exact
     largest = float(difference.abs().max())

@@ -2,10 +2,11 @@
 
     python experiments/figure4.py --out DIR
 
-Two objects, 10 µm × 3 µm and the same along y, one of them with a depression on the lens's side, lit along z. Light
-travels up the page, to the lens. Every object point sends a cone of rays as wide as the condenser's aperture through
-what lies above it; the mean curvature of its wave at the lens gives its effective defocus δ (torchdic.aberration).
-A plane of focus z_f is sharp not where z = z_f but along the line z + δ = z_f. Leaves DIR/figure4.png.
+Two objects, 10 µm × 3 µm and uniform along y, are lit along z. One has a depression on the side of the lens. Light
+travels up the page, to the lens. Every object point sends a cone of rays, as wide as the condenser's aperture, through
+the part of the object above it. The mean curvature of its wave at the lens gives the point's effective defocus δ
+(torchdic.object_aberration). For a focus z_f the points along the line z + δ = z_f are sharp, not those of the plane
+z = z_f. The script leaves DIR/figure4.png.
 """
 
 import argparse
@@ -50,13 +51,13 @@ def main() -> int:
 
 
 def dented(dent: tuple[tuple[float, float], tuple[float, float]] | None) -> Float[Tensor, "z x"]:
-    """Δn of the object: nearly rectangular, with smooth edges, less an ellipse on the lens's side."""
+    """Δn of the object: nearly rectangular, with smooth edges, without an ellipse on the side of the lens."""
     delta = CONTRAST * _covered((0.0, 0.0), SEMI_AXES, exponent=3.0)
     return delta if dent is None else delta * (1 - _covered(*dent, exponent=2.0))
 
 
 def _covered(centre: tuple[float, float], semi_axes: tuple[float, float], exponent: float) -> Float[Tensor, "z x"]:
-    """½(1 + tanh(depth/EDGE)) of |z/a_z|^e + |x/a_x|^e = 1, by its distance to first order, f/|∇f|."""
+    """½(1 + tanh(depth/EDGE)), the depth being that below |z/a_z|^e + |x/a_x|^e = 1 to first order, f/|∇f|."""
     z, x = (GRID.coordinates(axis, dtype=torch.float64) for axis in (0, 2))
     ratio = torch.stack(
         torch.meshgrid((z - centre[0]).abs() / semi_axes[0], (x - centre[1]).abs() / semi_axes[1], indexing="ij")
@@ -68,7 +69,7 @@ def _covered(centre: tuple[float, float], semi_axes: tuple[float, float], expone
 
 
 def aberration_map(delta: Float[Tensor, "z x"]) -> Float[Tensor, "z x"]:
-    """The effective defocus in µm of an object point at each voxel's centre."""
+    """The effective defocus in µm of the object point at each voxel's centre."""
     volume = Volume(GRID, delta[:, None], BACKGROUND)
     half_angle = math.asin(CONDENSER_NA / BACKGROUND)
     depths = GRID.coordinates(0, dtype=torch.float64).tolist()
@@ -77,7 +78,7 @@ def aberration_map(delta: Float[Tensor, "z x"]) -> Float[Tensor, "z x"]:
 
 
 def draw(objects: dict[str, Tensor], maps: dict[str, Tensor]) -> Figure:
-    """A row for each object: its index, its aberration, its planes of focus."""
+    """Draw a row for each object: its index, its aberration and its planes of focus."""
     height, _, width = GRID.extent
     box = (-width / 2, width / 2, -height / 2, height / 2)
     levels = ListedColormap(colormaps["plasma"](np.linspace(0, 0.85, len(PLANES))))

@@ -1,11 +1,11 @@
-"""The phase behind a measured DIC image of unknown optics: shear axis, background, phase.
+"""The phase behind one measured DIC image whose optics are unknown.
 
     python experiments/measured.py IMAGE.tif --out DIR
 
-Without IMAGE it takes the one that measured.toml names, from the folder in the environment variable TORCHDIC_DATA.
-The optics in measured.toml are guesses, so the phase has an arbitrary scale, and since shear and bias reversed
-together give the same image, an arbitrary sign. What the image shows, and this finds, is where the phase is and how it
-is shaped.
+The script finds the shear axis, flattens the background and fits a phase. Without IMAGE it takes the one that
+measured.toml names, from the folder in the environment variable TORCHDIC_DATA. The optics in measured.toml are guesses.
+So the scale of the phase is arbitrary. Its sign is arbitrary too, because the image stays the same if shear and bias
+are both reversed. Place and shape of the phase are what the image shows.
 """
 
 import argparse
@@ -62,7 +62,11 @@ def main() -> int:
 
 
 def adapt(config: Config, path: Path, pixels: tuple[int, int], axis: ShearAxis) -> Config:
-    """The configuration for an image: its path and size, and the shear along the axis that was found."""
+    """The configuration changed to an image's path and size, its shear turned to the axis that was found.
+
+    pixels: of the image, (y, x).
+    axis: the image's shear axis.
+    """
     (prism,) = config.acquisition.prisms
     assert prism is not None
     length = math.hypot(*(float(s) for s in prism.shear))
@@ -76,7 +80,7 @@ def adapt(config: Config, path: Path, pixels: tuple[int, int], axis: ShearAxis) 
 
 
 def draw(image, flattened, phase, axis: ShearAxis) -> Figure:
-    """The image as recorded, its background flattened, and the phase."""
+    """Draw the image as recorded, the image with a flat background, and the phase."""
     figure = Figure(figsize=(13, 3.6), layout="constrained")
     axes = figure.subplots(1, 3)
     for ax, values, title, cmap in (

@@ -10,7 +10,9 @@ import pytest
 import tifffile
 import tomli_w
 
-from recon.cli import SPECIMENS, main
+import torchdic
+from recon.cli import main
+from recon.cli.specimens import SPECIMENS
 from torchdic.files.stack import read_stack, write_stack
 
 CONFIG = """
@@ -341,9 +343,8 @@ def test_each_specimen_is_simulated_from_its_file(write, run, tmp_path, specimen
 def test_version_is_the_projects(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["--version"])
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert stopped.value.code == 0
-    assert capsys.readouterr().out == f"{project['name']} {project['version']}\n"
+    assert capsys.readouterr().out == f"torchdic {torchdic.__version__}\n"
 
 
 def test_a_folder_in_a_folder_that_is_not_there_yet_is_made(write, run, tmp_path):
@@ -395,23 +396,24 @@ def test_light_that_cannot_be_followed_is_one_line_and_exit_code_2(run, write, p
     [(2000, "2 arrays of 4×14×12 voxels"), (10_000, "2 prism settings × 3 focus planes of 4×14×12 voxels")],
 )
 def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkeypatch, free, wanted):
-    monkeypatch.setattr("torchdic.memory.free.free_bytes", lambda _device: free)
+    monkeypatch.setattr("torchdic.memory.free.available", lambda: free)
     line = refused("simulate", write())
     assert wanted in line
     assert "GiB are free" in line
 
 
 @pytest.mark.parametrize(
-    ("free", "wanted"), [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")]
+    "room", [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
 )
 @pytest.mark.parametrize("start", ["linear", "zero"])
 def test_a_reconstruction_without_room_is_refused_before_it_begins(
-    write, run, refused, monkeypatch, tmp_path, start, free, wanted
+    write, run, refused, monkeypatch, tmp_path, start, room
 ):
+    free, wanted = room
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())
-    monkeypatch.setattr("torchdic.memory.free.free_bytes", lambda _device: free)
+    monkeypatch.setattr("torchdic.memory.free.available", lambda: free)
     line = refused("reconstruct", write({"reconstruction.start": start}))
     assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before

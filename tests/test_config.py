@@ -7,9 +7,8 @@ import pytest
 import tomli_w
 import torch
 
-from recon.config.conversion import dump, flat
-from recon.config.reading import load
-from recon.config.schema import Config, ConfigError, UnitsWarning, VolumeSection
+from recon.config import Config, ConfigError, UnitsWarning, dump, flat, load
+from recon.config.schema import VolumeSection
 from recon.fit.bounds import Bounds
 from recon.fit.descent import Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
@@ -287,7 +286,6 @@ def test_a_key_that_is_unknown_or_missing_is_named(write, key, value, message):
         ("reconstruction.steps", 10.0, "must be a whole number"),
         ("reconstruction.steps", True, "must be a whole number"),
         ("fidelity.sources", "12", "must be a whole number"),
-        ("fidelity.propagation", "waves", "must be one of 'projection', 'rays', 'wave'"),
         ("fidelity.defocus", "parabolic", "must be one of 'exact', 'paraxial'"),
         ("fidelity.object_aberration", "sphere", "must be one of 'linear', 'cone'"),
         ("fidelity.order", True, "must be one of 1, 2"),
@@ -356,6 +354,7 @@ def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, nam
         ("acquisition.focus.1", math.nan, ["acquisition", "focus nan", "finite"]),
         ("acquisition.prisms.1.bias", math.nan, ["acquisition.prisms[1]", "bias nan", "finite"]),
         ("acquisition.prisms.0.shear", [0, math.inf], ["acquisition.prisms[0]", "shear x inf", "finite"]),
+        ("fidelity.propagation", "waves", ["fidelity", "propagation", "'waves'", "of 'projection', 'rays', 'wave'"]),
         ("fidelity.sources", 0, ["fidelity", "sources 0", "at least 1"]),
         ("fidelity.steps", 0, ["fidelity", "steps 0", "at least 1"]),
         ("fidelity.object_aberration", "cone", ["fidelity", "'cone' has no use", "wave"]),

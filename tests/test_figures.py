@@ -7,7 +7,7 @@ from matplotlib.patches import Rectangle
 
 from recon.fit.descent import Recipe
 from recon.report import figures
-from recon.report.comparison import Trial, compare, table
+from recon.report.comparison import Score, Truth, compare, table
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.files.stack import read_volume
 
@@ -203,21 +203,22 @@ def test_compare_leaves_every_volume_a_picture_and_the_numbers(tmp_path, capsys)
     with torch.no_grad():
         data = image(Volume(GRID, truth, 1.5), microscope, acquisition, Fidelity(sources=4))
     contenders = [(Fidelity(name, sources=3), Recipe(steps=3)) for name in ("projection", "wave")]
-    trials = compare(data, truth, truth > 0, GRID, 1.5, microscope, acquisition, contenders, tmp_path)
-    assert [trial.propagation for trial in trials] == ["projection", "wave"]
+    known = Truth(GRID, truth, 1.5, inside=truth > 0)
+    scores = compare(data, known, microscope, acquisition, contenders, tmp_path)
+    assert [score.propagation for score in scores] == ["projection", "wave"]
     names = {"projection.ome.tif", "wave.ome.tif", "comparison.png", "comparison.json"}
     assert {p.name for p in tmp_path.iterdir()} == names
-    for trial in trials:
-        delta, grid = read_volume(tmp_path / f"{trial.propagation}.ome.tif")
+    for score in scores:
+        delta, grid = read_volume(tmp_path / f"{score.propagation}.ome.tif")
         assert grid == GRID
-        assert trial.mean_delta == pytest.approx(float(delta[truth > 0].mean()))
-        assert trial.volume_error == pytest.approx(float((delta - truth).norm() / truth.norm()))
+        assert score.mean_delta == pytest.approx(float(delta[truth > 0].mean()))
+        assert score.volume_error == pytest.approx(float((delta - truth).norm() / truth.norm()))
     assert capsys.readouterr().err.count("projection") >= 1  # its progress bar
 
 
-def test_the_table_has_a_row_for_each_trial_and_the_truth():
-    trials = [Trial("wave", 0.1314, 0.02951, 0.0123, 12.34), Trial("rays", 0.5, 0.02, 0.2, 100.0)]
-    lines = table(trials, 0.03).splitlines()
+def test_the_table_has_a_row_for_each_score_and_the_truth():
+    scores = [Score("wave", 0.1314, 0.02951, 0.0123, 12.34), Score("rays", 0.5, 0.02, 0.2, 100.0)]
+    lines = table(scores, 0.03).splitlines()
     assert lines[1].split() == ["wave", "0.131", "0.0295", "0.0123", "12.3"]
     assert lines[-1].split() == ["truth", "0.000", "0.0300"]
     assert len(lines) == 4

@@ -17,7 +17,7 @@ from data_synthetic import Bead, GaussianBall
 from recon.cli import main
 from recon.config.conversion import converter, dump
 from recon.config.reading import load
-from recon.report.fronts import as_dict, draw_fronts, write_csv
+from recon.report.fronts import MARKS, as_dict, draw_fronts, marks_of, write_csv
 from recon.run.exact_images import exact_images
 from torchdic import (
     Acquisition,
@@ -318,6 +318,17 @@ def test_legend_says_what_the_marks_mean(some_trials):
     (legend,) = draw_fronts({"scene": some_trials}).legends
     words = {text.get_text() for text in legend.get_texts()}
     assert words == {"projection", "rays", "wave", "float64", "beaten by another", "Pareto front"}
+
+
+def test_any_propagation_has_a_mark_of_its_own():
+    """Those that the docs' figures show keep theirs, whatever appears beside them."""
+    names = ["echo", "wave", "glow", "echo", "projection"]
+    marks = marks_of(names)
+    assert list(marks) == ["projection", "wave", "echo", "glow"]
+    assert len(set(marks.values())) == 4
+    assert all(marks[name] == MARKS[name] for name in ("projection", "wave"))
+    many = marks_of(f"propagation {i}" for i in range(100))
+    assert len(many) == 100
 
 
 # --- the presets ------------------------------------------------------------------------------------------------------

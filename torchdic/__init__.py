@@ -30,6 +30,8 @@ from torchdic.propagation.presets import DRAFT, REFERENCE, STANDARD
 from torchdic.rays.trace import Rays, launch, trace
 from torchdic.specimen.volume import Volume
 
+__version__ = "0.1.0"
+
 __all__ = [
     "DRAFT",
     "REFERENCE",

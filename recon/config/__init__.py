@@ -1,6 +1,7 @@
-"""Configuration files: TOML whose schema is the domain's own dataclasses.
+"""Configuration files: TOML whose tables are the project's own dataclasses.
 
-Unknown keys, wrong types and unphysical values are errors that name the file, the key, the value and the law.
+An unknown key, a value of a wrong type and an unphysical value are errors. Each is one line that names the file, the
+key, the value and the law.
 """
 
 from recon.config.conversion import dump, flat

@@ -1,4 +1,8 @@
-"""From TOML's values to the configuration's dataclasses and back."""
+"""Conversion between TOML's values and the configuration's dataclasses, both ways.
+
+Each kind of value is one function here, which checks a value and converts it, and one row of a table at the end: TYPES
+for plain values, KINDS for types that are made of others, FIELDS for a field whose type doesn't say all.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -15,18 +19,28 @@ from torch import Tensor
 from recon.config.schema import CompensatorSection, Config, DataSection, WedgeSection
 from torchdic import Acquisition, Candidate, Condenser, JonesPupil, Layer, Objective, Polarisation, Prism, Spectrum
 
+# The name by which a list of prisms holds bright field, which has none.
 BRIGHT_FIELD = "brightfield"
 
-NONE = "none"  # TOML has no null: this is how to switch off what has a default
+# TOML has no null. This word switches off what has a default.
+NONE = "none"
+
+# Checks a value of TOML and converts it to a type. Raises TypeError or ValueError with the value and the law.
+Hook = Callable[[Any, Any], Any]
+
+converter = cattrs.Converter(forbid_extra_keys=True)
+
+
+# --- to TOML ----------------------------------------------------------------------------------------------------------
 
 
 def dump(config: Config) -> str:
-    """The resolved configuration as TOML: every default spelled out, what is absent by default left out."""
+    """The whole configuration as TOML, with every default; what is absent by default is left out."""
     return tomli_w.dumps(_plain(config))
 
 
 def flat(config: Config) -> list[str]:
-    """The resolved configuration as lines `key = value`, one for each value that isn't a table."""
+    """The whole configuration as lines `key = value`, one for each value that isn't a table."""
 
     def lines(key: str, value: Any) -> Iterator[str]:
         if isinstance(value, dict):
@@ -41,7 +55,27 @@ def flat(config: Config) -> list[str]:
     return list(lines("", _plain(config)))
 
 
-def _strict(kind: type, accepted: tuple[type, ...], words: str) -> Callable[[Any, Any], Any]:
+def _plain(value: Any) -> Any:
+    """A value as TOML can hold it: tensors as arrays, bright field by its name, None by its word or left out.
+
+    None is left out where it is the default.
+    """
+    if dataclasses.is_dataclass(value):
+        values = {f.name: (getattr(value, f.name), f.default) for f in dataclasses.fields(value)}
+        return {k: NONE if v is None else _plain(v) for k, (v, usual) in values.items() if not (v is usual is None)}
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items() if v is not None}
+    if isinstance(value, list | tuple):
+        return [BRIGHT_FIELD if v is None else _plain(v) for v in value]
+    return value.tolist() if isinstance(value, Tensor) else value
+
+
+# --- from TOML: single values -----------------------------------------------------------------------------------------
+
+
+def _strict(kind: type, accepted: tuple[type, ...], words: str) -> Hook:
+    """A hook for values of the accepted types alone, which become `kind`; true and false are no numbers."""
+
     def hook(value: Any, _: Any) -> Any:
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
             raise TypeError(f"{value!r} must be {words}")
@@ -50,46 +84,58 @@ def _strict(kind: type, accepted: tuple[type, ...], words: str) -> Callable[[Any
     return hook
 
 
-def _literal(value: Any, kind: Any) -> Any:
+_number = _strict(float, (int, float), "a number")
+_whole_number = _strict(int, (int,), "a whole number")
+_string = _strict(str, (str,), "a string")
+_truth_value = _strict(bool, (bool,), "true or false")
+
+
+def _choice(value: Any, kind: Any) -> Any:
     choices = get_args(kind)
     if not any(type(value) is type(choice) and value == choice for choice in choices):
         raise ValueError(f"{value!r} must be one of {', '.join(map(repr, choices))}")
     return value
 
 
-def _tuple(value: Any, kind: Any) -> tuple[Any, ...]:
+def _optional(value: Any, kind: Any) -> Any:
+    if value is None or value == NONE:
+        return None
+    return converter.structure(value, next(k for k in get_args(kind) if k is not type(None)))
+
+
+def _scale(value: Any, _: Any) -> float | str:
+    return value if value == "background" else _number(value, float)
+
+
+# --- from TOML: arrays ------------------------------------------------------------------------------------------------
+
+
+def _array_of_fixed_length(value: Any, kind: Any) -> tuple[Any, ...]:
     kinds = get_args(kind)
     if not isinstance(value, list | tuple) or len(value) != len(kinds):
         raise ValueError(f"{value!r} must be an array of {len(kinds)} values")
     return tuple(converter.structure(v, k) for v, k in zip(value, kinds, strict=True))
 
 
-def _prism(value: Any, _: Any) -> Prism | None:
-    if value == BRIGHT_FIELD:
-        return None
-    if not isinstance(value, dict):
-        raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
-    if "polariser" in value:
-        compensator = converter.structure(value, CompensatorSection)
-        return Prism.senarmont(compensator.shear, compensator.polariser, axis=compensator.axis)
-    if "wedge" in value:
-        given = vars(converter.structure(value, WedgeSection))
-        return Prism.from_wedge(given["wedge"], **{key: v for key, v in given.items() if key != "wedge"})
-    return converter.structure(value, Prism)
+def _pair(value: Any, _: Any) -> tuple[Any, ...]:
+    return _array_of_fixed_length(value, tuple[float, float])
 
 
-def _sequence_of(hook: Callable[[Any, Any], Any]) -> Callable[[Any, Any], tuple[Any, ...]]:
-    def structure_all(value: Any, _: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list | tuple):
-            raise TypeError(f"{value!r} must be an array")
-        return tuple(element(v, i) for i, v in enumerate(value))
+def _array_of(hook: Hook) -> Hook:
+    """A hook for an array of any length, each of whose elements another hook converts."""
 
     def element(value: Any, index: int) -> Any:
         try:
             return hook(value, None)
         except Exception as error:
+            # cattrs finds the element's place in this note, and the message then has it in its key
             error.add_note(IterableValidationNote(f"element {index}", index, None))
             raise IterableValidationError("an array's element", [error], tuple) from error  # pyright: ignore[reportCallIssue]
+
+    def structure_all(value: Any, _: Any) -> tuple[Any, ...]:
+        if not isinstance(value, list | tuple):
+            raise TypeError(f"{value!r} must be an array")
+        return tuple(element(v, i) for i, v in enumerate(value))
 
     return structure_all
 
@@ -101,36 +147,7 @@ def _tensor(value: Any, _: Any) -> Tensor:
         raise TypeError(f"{value!r} must be an array of numbers") from error
 
 
-def _pauli_zernike(value: Any, _: Any) -> dict[int, tuple[float, float]]:
-    if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
-        raise TypeError(f"{value!r} must be a table of Noll indices, each with a pair of numbers in rad")
-    return {int(key): _tuple(pair, tuple[float, float]) for key, pair in value.items()}
-
-
-def _candidate(value: Any, _: Any) -> Candidate:
-    return converter.structure(value, Candidate)
-
-
-def _aberrations(value: Any, _: Any) -> dict[int, float]:
-    if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
-        raise TypeError(f"{value!r} must be a table of Noll indices, each with its phase in rad")
-    return {int(key): _number(coefficient, float) for key, coefficient in value.items()}
-
-
-def _scale(value: Any, _: Any) -> float | str:
-    return value if value == "background" else _number(value, float)
-
-
-def _table(kind: type) -> Callable[[Any, Any], Any]:
-    own: dict[str, Any] = {key: override(struct_hook=hook) for key, hook in _hooks.get(kind, {}).items()}
-    fields = make_dict_structure_fn(kind, converter, **own)
-
-    def hook(value: Any, _: Any) -> Any:
-        if not isinstance(value, dict):
-            raise TypeError(f"{value!r} must be a table")
-        return fields(value, kind)
-
-    return hook
+# --- from TOML: tables ------------------------------------------------------------------------------------------------
 
 
 def _free_table(value: Any, _: Any) -> dict[str, Any]:
@@ -139,55 +156,81 @@ def _free_table(value: Any, _: Any) -> dict[str, Any]:
     return value
 
 
+def _section(kind: type) -> Hook:
+    """A hook for a table whose keys are a dataclass's fields, those in FIELDS by hooks of their own."""
+    own: dict[str, Any] = {key: override(struct_hook=hook) for key, hook in FIELDS.get(kind, {}).items()}
+    fields = make_dict_structure_fn(kind, converter, **own)
+    return lambda value, _: fields(_free_table(value, dict), kind)
+
+
+def _by_noll_index(hook: Hook, words: str) -> Hook:
+    """A hook for a table of Noll indices, each of whose values another hook converts."""
+
+    def structure_all(value: Any, _: Any) -> dict[int, Any]:
+        if not isinstance(value, dict) or not all(str(key).isdigit() for key in value):
+            raise TypeError(f"{value!r} must be a table of Noll indices, each with {words}")
+        return {int(key): hook(below, None) for key, below in value.items()}
+
+    return structure_all
+
+
+def _prism(value: Any, _: Any) -> Prism | None:
+    """A prism, given by its shear and bias or as one of PRISMS, or bright field by its name."""
+    if value == BRIGHT_FIELD:
+        return None
+    if not isinstance(value, dict):
+        raise TypeError(f"{value!r} must be a table of shear and bias, or {BRIGHT_FIELD!r}")
+    for key, section in PRISMS.items():
+        if key in value:
+            return converter.structure(value, section).prism()
+    return converter.structure(value, Prism)
+
+
+def _candidate(value: Any, _: Any) -> Candidate:
+    return converter.structure(value, Candidate)
+
+
+# --- which value goes by which hook -----------------------------------------------------------------------------------
+
+
 def _is_optional(kind: Any) -> bool:
     return get_origin(kind) in (Union, UnionType) and len(get_args(kind)) == 2 and type(None) in get_args(kind)
 
 
-def _optional(value: Any, kind: Any) -> Any:
-    if value is None or value == NONE:
-        return None
-    return converter.structure(value, next(k for k in get_args(kind) if k is not type(None)))
+def _has_fixed_length(kind: Any) -> bool:
+    return get_origin(kind) is tuple and Ellipsis not in get_args(kind)
 
 
-def _plain(value: Any) -> Any:
-    """What TOML can hold: None left out where it is the default, tensors as arrays, a missing prism by its name."""
-    if dataclasses.is_dataclass(value):
-        values = {f.name: (getattr(value, f.name), f.default) for f in dataclasses.fields(value)}
-        return {k: NONE if v is None else _plain(v) for k, (v, usual) in values.items() if not (v is usual is None)}
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items() if v is not None}
-    if isinstance(value, list | tuple):
-        return [BRIGHT_FIELD if v is None else _plain(v) for v in value]
-    return value.tolist() if isinstance(value, Tensor) else value
+# The hook of each plain type.
+TYPES: dict[type, Hook] = {float: _number, int: _whole_number, str: _string, bool: _truth_value}
 
-
-_number = _strict(float, (int, float), "a number")
-
-converter = cattrs.Converter(forbid_extra_keys=True)
-for _kind, _accepted, _words in (
-    (float, (int, float), "a number"),
-    (int, (int,), "a whole number"),
-    (str, (str,), "a string"),
-    (bool, (bool,), "true or false"),
-):
-    converter.register_structure_hook(_kind, _strict(_kind, _accepted, _words))
-converter.register_structure_hook_func(lambda kind: get_origin(kind) is Literal, _literal)
-converter.register_structure_hook_func(
-    lambda kind: get_origin(kind) is tuple and Ellipsis not in get_args(kind), _tuple
+# How a type made of others is told, and the hook for its values.
+KINDS: tuple[tuple[Callable[[Any], bool], Hook], ...] = (
+    (lambda kind: get_origin(kind) is Literal, _choice),
+    (lambda kind: get_origin(kind) is dict, _free_table),
+    (_has_fixed_length, _array_of_fixed_length),
+    (_is_optional, _optional),
 )
-converter.register_structure_hook_func(_is_optional, _optional)
-converter.register_structure_hook_func(lambda kind: get_origin(kind) is dict, _free_table)
 
-_hooks: dict[type, dict[str, Callable[[Any, Any], Any]]] = {
-    Prism: {"shear": lambda value, _: _tuple(value, tuple[float, float]), "bias": _number, "axis": _number},
-    Objective: {"aberrations": _aberrations},
+# The key that only one kind of prism has, and the section that reads it.
+PRISMS = {"polariser": CompensatorSection, "wedge": WedgeSection}
+
+# Fields whose type allows more than a file may say (a tensor, any sequence), and their hooks.
+FIELDS: dict[type, dict[str, Hook]] = {
+    Prism: {"shear": _pair, "bias": _number, "axis": _number},
+    Objective: {"aberrations": _by_noll_index(_number, "its phase in rad")},
     Layer: dict.fromkeys(("thickness", "index", "design_index"), _number),
     Polarisation: {field.name: _number for field in dataclasses.fields(Polarisation) if field.name != "pupil"},
-    JonesPupil: dict.fromkeys(("retardance", "diattenuation"), _pauli_zernike),
+    JonesPupil: dict.fromkeys(("retardance", "diattenuation"), _by_noll_index(_pair, "a pair of numbers in rad")),
     Condenser: {"points": _tensor, "weights": _tensor},
-    Spectrum: dict.fromkeys(("wavelengths", "weights"), _sequence_of(_number)),
-    Acquisition: {"prisms": _sequence_of(_prism), "focus": _sequence_of(_number)},
+    Spectrum: dict.fromkeys(("wavelengths", "weights"), _array_of(_number)),
+    Acquisition: {"prisms": _array_of(_prism), "focus": _array_of(_number)},
     DataSection: {"scale": _scale},
-    Config: {"candidates": _sequence_of(_candidate)},
+    Config: {"candidates": _array_of(_candidate)},
 }
-converter.register_structure_hook_factory(dataclasses.is_dataclass, _table)
+
+for _type, _hook in TYPES.items():
+    converter.register_structure_hook(_type, _hook)
+for _is_of, _hook in KINDS:
+    converter.register_structure_hook_func(_is_of, _hook)
+converter.register_structure_hook_factory(dataclasses.is_dataclass, _section)

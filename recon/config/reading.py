@@ -1,7 +1,4 @@
-"""Configuration files: TOML whose schema is the domain's own dataclasses.
-
-Unknown keys, wrong types and unphysical values are errors that name the file, the key, the value and the law.
-"""
+"""Reading of configuration files, and errors in one line where a file can't be used."""
 
 import dataclasses
 import difflib
@@ -22,10 +19,10 @@ T = TypeVar("T")
 
 
 def load(path: str | os.PathLike[str]) -> Config:
-    """Read a configuration file; relative paths in it start from its folder.
+    """Read a configuration file. A relative path in it starts from its folder.
 
-    Raises ConfigError. Warns UnitsWarning of a bias beyond a whole turn and of a shear longer than the volume is wide,
-    as they are in degrees and nm.
+    Raises ConfigError where the file can't be used. Warns UnitsWarning of a bias above 2π and of a shear longer than
+    the volume is wide: such values are likely in degrees and in nm.
     """
     path = Path(path)
     try:
@@ -61,7 +58,14 @@ def _warn_of_other_units(config: Config, path: Path) -> None:
 
 
 def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
-    """A dataclass from plain values. Raises ConfigError that names `source` and the key (below `where`)."""
+    """Make a dataclass of plain values.
+
+    values: as TOML holds them.
+    kind: the dataclass.
+    source: the file's name, with which messages begin.
+    where: the key of these values in the file, which precedes their own keys in messages.
+    Raises ConfigError where a key is unknown or missing, or where a value breaks its law.
+    """
     try:
         return converter.structure(values, kind)
     except Exception as error:
@@ -72,7 +76,10 @@ def structure(values: object, kind: type[T], source: str, where: str = "") -> T:
 
 
 def _first_problem(error: Exception, where: str) -> str | None:
-    """What is wrong, with its key: an unknown one before what it left missing. None for an error not about values."""
+    """What is wrong with the values, with its key; None for an error that isn't about them.
+
+    An unknown key comes before a missing one, because it is likely a misspelling of that one.
+    """
     problems = []
     for line in transform_error(error, path=where or "$", format_exception=_describe):
         message, _, path = line.rpartition(" @ ")
@@ -88,6 +95,7 @@ def _first_problem(error: Exception, where: str) -> str | None:
 
 
 def _describe(error: BaseException, _: Any) -> str:
+    """An error in the words of the user's file, for cattrs, which adds " @ " and the key."""
     if isinstance(error, ForbiddenExtraKeysError):
         name = min(error.extra_fields)
         known = [f.name for f in dataclasses.fields(error.cl)]

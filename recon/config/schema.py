@@ -1,4 +1,4 @@
-"""A configuration's sections: frozen dataclasses, among them the domain's own."""
+"""The sections of a configuration. Those of the microscope and the acquisition are torchdic's own dataclasses."""
 
 import math
 from collections.abc import Sequence
@@ -6,21 +6,27 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from recon.fit.descent import Recipe
-from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope
+from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope, Prism
 from torchdic.instrument.microscope import check_apertures
 
 
 class ConfigError(ValueError):
-    """A configuration that can't be used: one line with the file, the key, the value and the law."""
+    """A configuration can't be used. The message is one line with the file, the key, the value and the law."""
 
 
 class UnitsWarning(UserWarning):
-    """A value of a configuration that is so large that another unit was likely meant."""
+    """A value in a configuration is so large that another unit was likely meant."""
 
 
 @dataclass(frozen=True)
 class VolumeSection:
-    """The volume's grid: shape (z, y, x) in voxels, spacing (z, y, x) in µm, and the background's index."""
+    """The volume that is simulated or reconstructed.
+
+    shape: voxels (z, y, x).
+    spacing: size of a voxel (z, y, x) in µm.
+    background: refractive index of the medium.
+    Raises ValueError for an index below 1, and as Grid does.
+    """
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
@@ -39,16 +45,29 @@ class VolumeSection:
 
 @dataclass(frozen=True)
 class CompensatorSection:
-    """A prism whose bias de Sénarmont's polariser sets, see `Prism.senarmont`: shear (y, x) in µm, angles in rad."""
+    """A prism whose bias is set by the polariser of a de Sénarmont compensator; see `Prism.senarmont`.
+
+    shear: (y, x) in µm.
+    polariser: its angle in rad; the bias is twice that.
+    axis: of the prism, in rad; None as in `Prism`.
+    """
 
     shear: tuple[float, float]
     polariser: float
     axis: float | None = None
 
+    def prism(self) -> Prism:
+        """The prism with the bias that the polariser gives it."""
+        return Prism.senarmont(self.shear, self.polariser, axis=self.axis)
+
 
 @dataclass(frozen=True)
 class WedgeSection:
-    """A prism given by its wedge, see `Prism.from_wedge`, whose angle is `wedge`."""
+    """A prism given by its wedge; see `Prism.from_wedge`.
+
+    wedge: the wedge's angle in rad.
+    The other keys are the arguments of `Prism.from_wedge` under their own names.
+    """
 
     wedge: float
     focal_length: float
@@ -59,10 +78,24 @@ class WedgeSection:
     direction: tuple[float, float] = (0.0, 1.0)
     axis: float | None = None
 
+    def prism(self) -> Prism:
+        """The prism with the shear and bias that the wedge gives it."""
+        others = {name: value for name, value in vars(self).items() if name != "wedge"}
+        return Prism.from_wedge(self.wedge, **others)
+
 
 @dataclass(frozen=True)
 class DataSection:
-    """The measured stack, and how it is brought to the model's unit; see `recon.measured.prepare`."""
+    """The measured stack, and how it is brought to the model's unit; see `recon.recording.preparation.prepare`.
+
+    path: of the stack; a relative one starts from the configuration's folder.
+    flatten: whether each image is divided by its background; None does so for integer stacks only.
+    scale: counts of an empty bright field, or "background" to find them from the images' background; None does so for
+        integer stacks, and takes floats as relative to the empty bright field.
+    offset: counts that the camera gives in the dark.
+    order: of the polynomial in (y, x) that is fitted to a background.
+    Raises ValueError for a scale not above 0, an offset that isn't finite and an order below 0.
+    """
 
     path: str
     flatten: bool | None = None
@@ -81,9 +114,10 @@ class DataSection:
 
 @dataclass(frozen=True)
 class ReconstructionSection(Recipe):
-    """How to descend, see `recon.descend.Recipe`, and how often to save.
+    """How to fit the volume, see `recon.descend.Recipe`, and how often to save a checkpoint.
 
-    checkpoint_every: steps between checkpoints.
+    checkpoint_every: steps between two checkpoints.
+    Raises ValueError where a value breaks its law.
     """
 
     checkpoint_every: int = 10
@@ -96,7 +130,11 @@ class ReconstructionSection(Recipe):
 
 @dataclass(frozen=True)
 class SimulationSection:
-    """How to simulate. seed: of the camera's noise. exact: the specimen's exact field instead of a propagation."""
+    """How to simulate.
+
+    seed: of the camera's noise.
+    exact: whether the images come from the specimen's exact field instead of a propagation.
+    """
 
     seed: int = 0
     exact: bool = False
@@ -104,9 +142,11 @@ class SimulationSection:
 
 @dataclass(frozen=True)
 class WorkPrecisionSection:
-    """How to measure work and precision.
+    """How `torchdic work-precision` measures.
 
-    repeats: timed runs. reference: what counts as converged; None is finer than every candidate.
+    repeats: how often each candidate is timed.
+    reference: the fidelity whose result counts as converged; None takes one that is finer than every candidate.
+    Raises ValueError for repeats below 1.
     """
 
     repeats: int = 3
@@ -121,9 +161,16 @@ class WorkPrecisionSection:
 class Config:
     """All sections of a configuration file.
 
-    fidelity: None leaves it to the command. tolerance: of the images, for which a fidelity is planned, see
-    `torchdic.plan`; the two exclude each other. specimen: left to `data_synthetic`, which knows its kinds. candidates:
-    whose work and precision are measured; None is `torchdic.precision.ladder`.
+    volume, microscope, acquisition: the volume, the microscope, and what was recorded with it.
+    data: the measured stack; None where there is none.
+    fidelity: how carefully to compute; None lets the command choose.
+    reconstruction, simulation, work_precision: how the commands of these names work.
+    specimen: the kind and the measures of a known specimen, which `recon.cli` makes of it; None where there is none.
+    tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
+    candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
+        `torchdic.planning.work_precision.ladder`.
+    Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
+    exceeds the medium's index, and for an empty list of candidates.
     """
 
     volume: VolumeSection

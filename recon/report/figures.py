@@ -1,4 +1,4 @@
-"""Pictures of a reconstruction: images beside the model's, sections through the volume, the misfit's way down."""
+"""Pictures of a reconstruction: images beside the model's, sections through the volume, and the fall of the misfit."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,21 +11,23 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from recon.run.checkpoint import Row
 from torchdic import Grid, Prism
 from torchdic.files.whole import written_whole
 
 DPI = 150
 
+# Focus planes that a picture of a whole stack shows at most.
+MOST_PLANES = 7
+
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG. If that fails, an earlier file stays as it was."""
     with written_whole(path) as partial:
         figure.savefig(partial, dpi=DPI)
 
 
 def leave(figure: Figure, path: Path) -> int:
-    """Save a script's figure in a folder made for it, and print where it is; returns the script's exit code."""
+    """Save a script's figure, make its folder where it is missing, and print where it is; returns the exit code."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(figure, path)
@@ -43,7 +45,12 @@ def draw_images(
     focus: Sequence[float | Tensor],
     grid: Grid,
 ) -> Figure:
-    """Measured, modelled and residual images, a row for each prism at its middle focus plane."""
+    """Draw measured and modelled images and their difference: a row for each prism, three focus planes at most.
+
+    measured, modelled: stacks in units of the empty bright field.
+    prisms, focus: the stacks' prism settings (None is bright field) and focus planes in µm.
+    grid: the volume's, whose (y, x) spacing is the pixels'.
+    """
     planes = sorted({len(focus) // 4, len(focus) // 2, (3 * len(focus)) // 4})
     aspect = grid.extent[1] / grid.extent[2]
     figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
@@ -51,29 +58,33 @@ def draw_images(
     residual = measured - modelled
     largest = float(residual[:, planes].abs().max())
     for p, prism in enumerate(prisms):
-        low, high = float(measured[p].min()), float(measured[p].max())
+        grey = ("gray", (float(measured[p].min()), float(measured[p].max())))
+        kinds = {
+            "measured": (measured, *grey),
+            "modelled": (modelled, *grey),
+            "residual": (residual, "RdBu_r", (-largest, largest)),
+        }
         for k, f in enumerate(planes):
             trio = axes[p, 3 * k : 3 * k + 3]
-            for ax, stack, name in zip(
-                trio, (measured, modelled, residual), ("measured", "modelled", "residual"), strict=True
-            ):
-                limits = (-largest, largest) if stack is residual else (low, high)
-                cmap = "RdBu_r" if stack is residual else "gray"
-                shown = _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
+            for ax, (name, (stack, cmap, limits)) in zip(trio, kinds.items(), strict=True):
+                _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
                 if p == 0:
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
-                if ax is axes[p, 0]:
-                    ax.set_ylabel(_caption(prism), fontsize=8)
-                if ax is trio[-1] and ax is axes[p, -1]:
-                    figure.colorbar(shown, ax=ax, label="residual")
             _scale_bar(trio[0], grid.extent[2], "white")
+        axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
+        figure.colorbar(axes[p, -1].images[0], ax=axes[p, -1], label="residual")
     return figure
 
 
 def draw_sections(
     volumes: Mapping[str, Float[Tensor, "z y x"]], grid: Grid, planes: Sequence[str] = ("xy", "xz", "yz")
 ) -> Figure:
-    """Sections through the first volume's centre of |Δn|: a column for each volume, a row for each plane, one scale."""
+    """Draw sections through volumes on one scale: a column for each volume, a row for each plane.
+
+    volumes: Δn (z, y, x) by title. All sections go through the centre of |Δn| of the first volume.
+    grid: of all volumes.
+    planes: of "xy", "xz" and "yz", the horizontal axis first.
+    """
     through = _centre(next(iter(volumes.values())))
     top = max(float(v.max()) for v in volumes.values())
     bottom = min(0.0, *(float(v.min()) for v in volumes.values()))
@@ -100,8 +111,8 @@ def draw_sections(
     return figure
 
 
-def draw_misfit(rows: Sequence[Row]) -> Figure:
-    """The misfit over the steps, on a logarithmic scale."""
+def draw_misfit(rows: Sequence[tuple[int, float, float, float]]) -> Figure:
+    """Draw the misfit over the steps on a logarithmic scale; rows: (step, misfit, loss, seconds), as in log.csv."""
     figure = Figure(figsize=(5, 3), layout="constrained")
     ax = figure.subplots()
     ax.semilogy([row[0] for row in rows], [row[1] for row in rows])
@@ -117,8 +128,13 @@ def draw_stack(
     focus: Sequence[float | Tensor],
     spacing: tuple[float, float],
 ) -> Figure:
-    """A stack's images, a row for each prism on one scale of grey; at most seven focus planes, evenly chosen."""
-    planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), 7)).round().astype(int))
+    """Draw a stack: a row for each prism, with its own scale of grey; MOST_PLANES focus planes at most, evenly chosen.
+
+    stack: in any unit.
+    prisms, focus: the stack's prism settings (None is bright field) and focus planes in µm.
+    spacing: distance (y, x) between pixels in µm.
+    """
+    planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), MOST_PLANES)).round().astype(int))
     aspect = stack.shape[2] * spacing[0] / (stack.shape[3] * spacing[1])
     figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
@@ -152,7 +168,7 @@ def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: 
 
 
 def _scale_bar(ax: Axes, width: float, colour: str) -> None:
-    """A bar of about a quarter of the width, 1, 2 or 5 times a power of ten in µm."""
+    """Add a bar of 1, 2 or 5 times a power of ten in µm, at most a quarter of the picture's width (µm) long."""
     power = 10.0 ** np.floor(np.log10(width / 4))
     length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)
     bottom, top = ax.get_ylim()
@@ -170,6 +186,7 @@ def _scale_bar(ax: Axes, width: float, colour: str) -> None:
 
 
 def _centre(volume: Tensor) -> tuple[int, int, int]:
+    """The voxel (z, y, x) at the |Δn|-weighted mean place; the middle one of an empty volume."""
     weight = volume.detach().abs()
     if float(weight.sum()) == 0:
         nz, ny, nx = volume.shape

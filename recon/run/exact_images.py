@@ -1,4 +1,4 @@
-"""Images of a known specimen: through one of the propagations, or from its exact field."""
+"""Images of a known specimen from its exact field."""
 
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
@@ -9,9 +9,12 @@ from torch import Tensor
 
 from torchdic import Acquisition, Fidelity, Grid, Microscope, image_field
 
-# The exact field is spread over an array wider by this fraction on each side and cropped after imaging: what leaves the
-# volume's sides must not come back on the other one.
-MARGIN = 0.5
+# The exact field is computed on an array that is wider than the grid by this fraction on each side. Its images are
+# cropped to the grid, so that light which leaves the grid at one side doesn't come back in at the other.
+WIDENING = 0.5
+
+# Sources whose fields are held at once.
+SOURCES_AT_ONCE = 16
 
 
 @runtime_checkable
@@ -33,7 +36,13 @@ class ExactSpecimen(Protocol):
         padding: float,
         na: float | None,
     ) -> Complex[Tensor, "source y x"]:
-        """Each source's envelope at depth `plane`, on the grid's pixels."""
+        """The envelopes (source, y, x) of the sources' light at depth `plane` (µm), on the grid's pixels.
+
+        wavelength: in µm.
+        points: directions (source, 2) in NA units (y, x).
+        padding: times the grid's own width within which the field is computed.
+        na: aperture to which the field is limited; None keeps all waves.
+        """
         ...
 
 
@@ -41,21 +50,27 @@ class ExactSpecimen(Protocol):
 def exact_images(
     specimen: ExactSpecimen, grid: Grid, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
 ) -> Float[Tensor, "prism focus y x"]:
-    """Images of a specimen from its exact field, float64: none of our propagations takes part."""
-    _, ny, nx = grid.shape
-    top, left = round(MARGIN * ny), round(MARGIN * nx)  # alike on both sides: the centre stays the centre
-    wide = grid.widened(top, left)
+    """Images of a specimen from its exact field, float64. None of torchdic's propagations takes part.
+
+    specimen: knows its exact field.
+    grid: its (y, x) pixels are the images', unless the microscope's camera has pixels of its own.
+    microscope, acquisition: as for `torchdic.image`; the camera's noise and counts are left out.
+    fidelity: only its number of sources counts.
+    """
     if microscope.spectrum is not None:
         colours = microscope.colours()
         return torch.stack(
             [share * exact_images(specimen, grid, p, acquisition, fidelity) for p, share in colours]
         ).sum(0)
+    _, ny, nx = grid.shape
+    top, left = round(WIDENING * ny), round(WIDENING * nx)  # the same on both sides, so that the centre stays
+    wide = grid.widened(top, left)
     points, weights = microscope.sources(fidelity.sources, dtype=torch.float64, device=torch.device("cpu"))
     na = None
     if microscope.objective is not None:
         na = min(1.05 * microscope.objective.na, specimen.background)
     total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), *wide.shape[1:], dtype=torch.float64)
-    for some, share in zip(points.split(16), weights.split(16), strict=True):
+    for some, share in zip(points.split(SOURCES_AT_ONCE), weights.split(SOURCES_AT_ONCE), strict=True):
         part = replace(microscope.lit_from(some, share), camera=None)
         field = specimen.field(wide, microscope.wavelength, some, padding=1.0, na=na)
         images = image_field(field, wide, part, acquisition, background=specimen.background)

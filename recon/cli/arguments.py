@@ -1,0 +1,63 @@
+"""The arguments that commands share: each function here adds one to a command's parser."""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from torchdic import __version__
+
+
+def config(parser: argparse.ArgumentParser) -> None:
+    """The configuration file."""
+    parser.add_argument(
+        "config",
+        type=Path,
+        metavar="CONFIG.toml",
+        help="configuration file: volume, microscope, acquisition, and the data or the specimen",
+    )
+
+
+def out(parser: argparse.ArgumentParser) -> None:
+    """The folder for the results."""
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for the results; it is made where it is missing"
+    )
+
+
+def out_if_wanted(parser: argparse.ArgumentParser) -> None:
+    """A folder for a command that prints its results, and may save them too."""
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to save the plan in, as plan.json")
+
+
+def device(parser: argparse.ArgumentParser) -> None:
+    """Where to compute."""
+    parser.add_argument(
+        "--device",
+        type=_device,
+        default="auto",
+        help="where to compute: cpu, cuda, … (default: a GPU if PyTorch finds one)",
+    )
+
+
+def earlier_run(parser: argparse.ArgumentParser) -> None:
+    """What to do with an interrupted run that is found in the folder."""
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("--resume", action="store_true", help="continue the interrupted run in DIR, if there is one")
+    choice.add_argument("--restart", action="store_true", help="start again and discard an interrupted run in DIR")
+
+
+def version(parser: argparse.ArgumentParser) -> None:
+    """The version of torchdic."""
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}", help="print the version")
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        tensor = torch.zeros(1, device=name)
+        tensor.item()  # fails on the device "meta", which holds no values
+    except (RuntimeError, AssertionError) as error:
+        raise argparse.ArgumentTypeError(f"{name!r} is no device here: {str(error).splitlines()[0]}") from error
+    return tensor.device

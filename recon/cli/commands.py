@@ -1,0 +1,125 @@
+"""The commands, a row each, and what happens to their errors and warnings."""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from tqdm import tqdm
+
+from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
+from recon.config.schema import ConfigError
+from recon.run.checkpoint import CheckpointError
+from recon.run.reconstruct import InterruptedRunError
+from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
+from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: its help in one line, the function that runs it, and the arguments that it takes."""
+
+    help: str
+    run: Callable[[argparse.Namespace], None]
+    arguments: tuple[Callable[[argparse.ArgumentParser], None], ...]
+
+
+COMMANDS = {
+    "demo": Command(
+        "simulate a small bead, reconstruct it in three ways and compare each with the truth",
+        demo.run,
+        (arguments.out,),
+    ),
+    "simulate": Command(
+        "simulate the DIC images of a known specimen",
+        simulate.run,
+        (arguments.config, arguments.out, arguments.device),
+    ),
+    "plan": Command(
+        "find the fastest way to compute images within a tolerance, and which effects matter",
+        plan.run,
+        (arguments.config, arguments.out_if_wanted, arguments.device),
+    ),
+    "reconstruct": Command(
+        "find the refractive-index volume behind a stack of DIC images",
+        reconstruct.run,
+        (arguments.config, arguments.out, arguments.device, arguments.earlier_run),
+    ),
+    "work-precision": Command(
+        "measure what accuracy costs: the error of images against seconds and memory",
+        work_precision.run,
+        (arguments.config, arguments.out, arguments.device),
+    ),
+}
+
+
+def main(typed: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    typed: the words after `torchdic`; None takes them from the command line.
+    Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
+    """
+    options = _parser().parse_args(typed)
+    _show_each_warning_once()
+    try:
+        options.run(options)
+    except (ConfigError, StackError, CheckpointError) as error:
+        return _fail(str(error), BAD_INPUT)
+    except TurnedRaysError as error:
+        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
+    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
+        return _fail(f"{options.config}: {error}", BAD_INPUT)
+    except FloatingPointError as error:
+        return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
+    except (InterruptedRunError, KeyboardInterrupt) as error:
+        return _fail(str(error) or "interrupted", INTERRUPTED)
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that reports an error in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="torchdic",
+        description="Simulate DIC images, and reconstruct the refractive-index volume behind measured ones.",
+        epilog="torchdic COMMAND --help explains a command.",
+    )
+    arguments.version(parser)
+    found = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, command in COMMANDS.items():
+        below = found.add_parser(name, help=command.help, description=f"{command.help[0].upper()}{command.help[1:]}.")
+        below.set_defaults(run=command.run)
+        for add in command.arguments:
+            add(below)
+    return parser
+
+
+def _show_each_warning_once() -> None:
+    """Show each warning once, as one line above the progress bar.
+
+    Python's own rule "once" would show a warning again for each module that it comes from.
+    """
+    shown: set[str] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
+
+    warnings.showwarning = show
+    for kind in (SamplingWarning, ToleranceWarning):
+        warnings.simplefilter("always", kind)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"torchdic: error: {message}", file=sys.stderr)
+    return code

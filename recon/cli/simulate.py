@@ -1,0 +1,91 @@
+"""torchdic simulate: the DIC images of a known specimen."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from recon.cli.specimens import check_exact_field, specimen_of, voxels
+from recon.config.conversion import dump
+from recon.config.reading import load
+from recon.config.schema import Config, ConfigError
+from recon.fit.planned import announce
+from recon.report import figures
+from recon.run.exact_images import exact_images
+from recon.run.reconstruct import prepare_folder
+from torchdic import STANDARD, Fidelity, Volume, image, plan
+from torchdic.files.stack import write_stack
+from torchdic.files.whole import write_json, write_text
+from torchdic.forward.foresee import allotted
+
+
+def run(options: argparse.Namespace) -> None:
+    """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder."""
+    config = load(options.config)
+    specimen = specimen_of(config, str(options.config))
+    if config.simulation.exact and config.tolerance is not None:
+        raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
+    check_exact_field(config, specimen, str(options.config))
+    if config.simulation.exact:
+        images = _from_the_exact_field(config, specimen, options.out)
+    else:
+        images = _by_a_propagation(config, specimen, options.out, options.device)
+    _write(config, images, options.out)
+
+
+def _from_the_exact_field(config: Config, specimen: Any, out: Path) -> Tensor:
+    prepare_folder(out)
+    fidelity = config.fidelity or STANDARD
+    return exact_images(specimen, config.volume.grid, config.microscope, config.acquisition, fidelity)
+
+
+@torch.no_grad()
+def _by_a_propagation(config: Config, specimen: Any, out: Path, device: torch.device) -> Tensor:
+    volume = voxels(specimen, config.volume.grid, device)
+    fidelity = config.fidelity or STANDARD
+    if config.tolerance is None:
+        allotted(volume, config.microscope, config.acquisition, fidelity)  # refuses before the folder is made
+        prepare_folder(out)
+    else:
+        prepare_folder(out)
+        fidelity = _planned(config, volume, config.tolerance, out)
+    return image(volume, config.microscope, config.acquisition, fidelity).cpu()
+
+
+def _planned(config: Config, volume: Volume, tolerance: float, out: Path) -> Fidelity:
+    """The fidelity that meets the tolerance; leaves the plan and the configuration that it amounts to in the folder."""
+    planned = plan(volume, config.microscope, config.acquisition, tolerance)
+    print(f"{announce(planned)}, predicted {planned.seconds:.2g} s", flush=True)
+    write_json(out / "plan.json", planned.as_dict())
+    resolved = replace(config, fidelity=planned.fidelity, tolerance=None)
+    write_text(out / "config.resolved.toml", f"# {announce(planned)}\n{dump(resolved)}")
+    return planned.fidelity
+
+
+def _write(config: Config, images: Tensor, out: Path) -> None:
+    """Record the images with the camera, if there is one, and write them as a stack and as a picture."""
+    camera, acquisition = config.microscope.camera, config.acquisition
+    pixel = config.volume.grid.spacing[1:]
+    if camera is not None:
+        pixel = camera.pixel_spacing(pixel)
+        images = camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
+    focus = [float(f) for f in acquisition.focus]
+    # a camera's counts stay integers, which is how a reader of the file recognises them
+    data = images.float() if images.is_floating_point() else images
+    write_stack(out / "stack.ome.tif", data, pixel, equal_step(focus))
+    figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), out / "stack.png")
+    prisms, planes, ny, nx = images.shape
+    print(f"{out / 'stack.ome.tif'}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")
+
+
+def equal_step(focus: Sequence[float]) -> float | None:
+    """The distance in µm between focus planes; None unless they rise in equal steps."""
+    steps = [b - a for a, b in pairwise(focus)]
+    if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
+        return None
+    return steps[0]

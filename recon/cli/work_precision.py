@@ -1,0 +1,60 @@
+"""torchdic work-precision: what accuracy costs, measured on the configuration's scene."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from recon.cli.specimens import check_exact_field, specimen_of, voxels
+from recon.config.reading import load
+from recon.config.schema import Config
+from recon.report import figures
+from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
+from recon.run.exact_images import exact_images
+from recon.run.reconstruct import prepare_folder
+from torchdic import STANDARD, Candidate, Fidelity, Trial
+from torchdic.files.whole import write_json
+from torchdic.planning.ladders import reaches_a_side
+from torchdic.planning.work_precision import converged_fidelities, ladder, trials
+
+
+def run(options: argparse.Namespace) -> None:
+    """Time each candidate, compare it with the truth, and leave the measurements as CSV, JSON and a figure."""
+    config = load(options.config)
+    specimen = specimen_of(config, str(options.config))
+    check_exact_field(config, specimen, str(options.config))
+    grid, microscope, acquisition = config.volume.grid, config.microscope, config.acquisition
+    volume = voxels(specimen, grid, options.device)
+    candidates = config.candidates or ladder(grid, padded=not reaches_a_side(volume))
+    reference = _references(config, candidates)
+    prepare_folder(options.out)
+    exact = None
+    if hasattr(specimen, "field"):
+        # the exact field is lit from as many directions as the reference of the default propagation
+        lit = reference[STANDARD.propagation]
+        exact = exact_images(specimen, grid, microscope, acquisition, lit).to(options.device)
+    steps = trials(
+        volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats
+    )
+    found = list(tqdm(steps, desc="work-precision", total=len(candidates), unit="candidate"))
+    _write(found, reference, str((config.specimen or {})["kind"]), options.out)
+
+
+def _references(config: Config, candidates: Sequence[Candidate]) -> dict[str, Fidelity]:
+    """For each propagation the fidelity whose result counts as converged: the configuration's, or the usual one."""
+    reference: dict[str, Fidelity] = converged_fidelities(candidates, config.volume.grid)
+    given = config.work_precision.reference
+    if given is None:
+        return reference
+    return {propagation: replace(given, propagation=propagation) for propagation in reference}
+
+
+def _write(found: Sequence[Trial], reference: Mapping[str, Fidelity], scene: str, out: Path) -> None:
+    """Write the measurements as CSV, JSON and a figure, and print them as a table."""
+    write_csv(out / "work_precision.csv", found)
+    write_json(out / "work_precision.json", as_dict(found, reference))
+    figures.save(draw_fronts({scene: found}), out / "work_precision.png")
+    print(as_table(found))
+    print(f"\n{out / 'work_precision.csv'}, .json and .png: {len(found)} candidates")
