@@ -34,14 +34,15 @@ from data_synthetic import (
 from recon.config.conversion import dump
 from recon.config.reading import load, structure
 from recon.config.schema import Config, ConfigError
-from recon.fit.descent import Recipe
 from recon.fit.planned import announce
+from recon.fit.problem import Recipe
 from recon.report import figures
 from recon.report.comparison import compare, table
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.run.checkpoint import CheckpointError
 from recon.run.exact_images import exact_images
-from recon.run.reconstruct import RECOMMENDED, InterruptedRunError, prepare_folder, reconstruct
+from recon.run.interruption import InterruptedRunError
+from recon.run.reconstruct import RECOMMENDED, prepare_folder, reconstruct
 from torchdic import (
     STANDARD,
     Acquisition,

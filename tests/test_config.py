@@ -11,7 +11,7 @@ from recon.config.conversion import dump, flat
 from recon.config.reading import load
 from recon.config.schema import Config, ConfigError, UnitsWarning, VolumeSection
 from recon.fit.bounds import Bounds
-from recon.fit.descent import Recipe
+from recon.fit.problem import Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
 
 CONTRACT = """
