@@ -143,11 +143,13 @@ class Unknowns:
         groups = [{"params": [self._parameters[u.name]], "lr": u.learning_rate} for u in self._unknowns]
         adam = torch.optim.Adam(groups)
         if state is not None:
+            moments = {
+                index: {key: value for key, value in state[unknown.name].items() if key != "parameter"}
+                for index, unknown in enumerate(self._unknowns)
+            }
             # copied, because Adam changes its moments in place
-            saved = {index: copy.deepcopy(state[unknown.name]) for index, unknown in enumerate(self._unknowns)}
-            for moments in saved.values():
-                del moments["parameter"]
-            adam.load_state_dict({"state": saved, "param_groups": adam.state_dict()["param_groups"]})
+            saved = {"state": copy.deepcopy(moments), "param_groups": adam.state_dict()["param_groups"]}
+            adam.load_state_dict(saved)
         return adam
 
     def set_rates(self, adam: torch.optim.Adam, step: int, steps: int) -> None:

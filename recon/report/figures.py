@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 
-from recon.fit.descent import Row
+from recon.run.checkpoint import Row
 from torchdic import Grid, Prism
 from torchdic.files.whole import written_whole
 

@@ -31,7 +31,7 @@ class Checkpoint:
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint. The file is complete, or it is what it was before."""
+    """Write a checkpoint. If that fails, an earlier one in the file stays as it was."""
     step = {f.name: getattr(checkpoint.step, f.name) for f in fields(Step)}
     content = {"format": FORMAT, "step": step, "rows": checkpoint.rows, "identity": checkpoint.identity}
     with written_whole(path) as partial:

@@ -59,7 +59,7 @@ def reconstruct(
         _check_room(config, config.fidelity, data)
     problem = _problem(config, data, misfit)
     identity = _identity(config, measured, problem.misfit)
-    start = _earlier(out / CHECKPOINT, identity, resume=resume, restart=restart)
+    start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
     prepare_folder(out)
     ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
     result = write_results(out, config, measured, problem, ended)
@@ -94,9 +94,9 @@ def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit]) -
     """What the configuration asks to be fitted to the data, with the fidelity or for the tolerance that it gives."""
     medium = empty_medium(config.volume.grid, config.volume.background, data)
     setup = Setup(medium, config.microscope, config.acquisition)
-    careful = config.fidelity or config.tolerance
-    assert careful is not None
-    return Problem.from_recipe(data, setup, careful, config.reconstruction, misfit)
+    fidelity = config.fidelity or config.tolerance
+    assert fidelity is not None
+    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit)
 
 
 def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:
@@ -112,7 +112,7 @@ def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:
     return "\n".join([*flat(fit), f"misfit = {misfit.name}", f"data's sha256 = {digest}"])
 
 
-def _earlier(saved: Path, identity: str, *, resume: bool, restart: bool) -> Checkpoint | None:
+def _checkpoint_to_resume(saved: Path, identity: str, *, resume: bool, restart: bool) -> Checkpoint | None:
     """The checkpoint to go on from, None to begin anew. Raises CheckpointError where the user must choose."""
     if not saved.exists():
         return None

@@ -25,7 +25,7 @@ from torchdic.files.whole import write_json, write_text
 
 
 class PoorFitWarning(UserWarning):
-    """A descent has ended at a volume that explains its data less than empty medium does."""
+    """The volume that a descent found explains its data less well than empty medium does."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ def metrics(
 ) -> dict[str, Any]:
     """The numbers of metrics.json.
 
-    images: the model's, of the last step. reports: what was found in each prism's measured images, among it the
-    standard deviation of their noise.
+    images: the model's, of the last step. reports: what the preparation found in each prism's measured images, such as
+    the standard deviation of their noise.
     """
     noise = [report.noise for report in reports if report.noise is not None]
     found: dict[str, Any] = {
@@ -68,7 +68,10 @@ def metrics(
 
 
 def warn_of_poor_fit(misfit: float) -> None:
-    """Warn PoorFitWarning where empty medium would explain the stack better than the volume that was found."""
+    """Warn PoorFitWarning where empty medium would explain the stack better than the volume that was found.
+
+    misfit: of that volume.
+    """
     if misfit > 1:
         warnings.warn(
             f"the misfit {misfit:.3g} is above 1: empty medium would explain the stack better; "
