@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from recon.fit.problem import Recipe
+from recon.fit.descent import Recipe
 from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope
 from torchdic.instrument.microscope import check_apertures
 
