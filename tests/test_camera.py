@@ -12,8 +12,8 @@ from data_synthetic import Bead
 from recon.cli import main
 from recon.config.conversion import dump
 from recon.config.reading import load
+from recon.run.data import load_data
 from recon.run.exact_images import exact_images
-from recon.run.reconstruct import load_data
 from torchdic import (
     Acquisition,
     Camera,

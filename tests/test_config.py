@@ -10,7 +10,7 @@ import torch
 from recon.config import Config, ConfigError, UnitsWarning, dump, flat, load
 from recon.config.schema import VolumeSection
 from recon.fit.bounds import Bounds
-from recon.fit.descent import Recipe
+from recon.fit.problem import Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Microscope, Objective, Prism
 
 CONTRACT = """

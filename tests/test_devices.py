@@ -7,7 +7,8 @@ import pytest
 import torch
 from distant import DISTANT, Device, bring, send
 
-from recon.fit.descent import Recipe, descend
+from recon.fit.descent import descend
+from recon.fit.problem import Recipe
 from torchdic import (
     Acquisition,
     Camera,

@@ -5,7 +5,7 @@ from matplotlib import image as pictures
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from recon.fit.descent import Recipe
+from recon.fit.problem import Recipe
 from recon.report import figures
 from recon.report.comparison import Score, Truth, compare, table
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image

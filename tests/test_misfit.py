@@ -3,11 +3,13 @@ from itertools import pairwise
 
 import pytest
 import torch
+from absolute import Absolute
 
 from recon.fit.bounds import SHARPNESS, Bounds
-from recon.fit.misfit import gaussian, spatial_variance
-from recon.fit.prior import SMOOTHING, magnitude, total_variation
+from recon.fit.misfit import GaussianMisfit, spatial_variance
+from recon.fit.prior import SMOOTHING, Magnitude, TotalVariation, magnitude, total_variation
 from recon.fit.schedule import cosine, held_then_annealed
+from torchdic import Grid, Volume
 
 BOUNDS = {
     "free": Bounds(None, None),
@@ -36,11 +38,11 @@ def bounds(request):
 
 def test_an_empty_models_misfit_is_1(data):
     level = data.mean((2, 3), keepdim=True).expand_as(data)
-    assert gaussian(level, data, spatial_variance(data)).item() == pytest.approx(1, rel=1e-5)
+    assert GaussianMisfit(data)(level).item() == pytest.approx(1, rel=1e-5)
 
 
 def test_a_perfect_models_misfit_is_0(data):
-    assert gaussian(data, data, spatial_variance(data)).item() == 0
+    assert GaussianMisfit(data)(data).item() == 0
 
 
 def test_every_prism_counts_alike_whatever_its_contrast(data):
@@ -48,7 +50,7 @@ def test_every_prism_counts_alike_whatever_its_contrast(data):
     for prism in range(3):
         images = data.clone()
         images[prism] = level[prism]
-        assert gaussian(images, data, spatial_variance(data)).item() == pytest.approx(1 / 3, rel=1e-4)
+        assert GaussianMisfit(data)(images).item() == pytest.approx(1 / 3, rel=1e-4)
 
 
 def test_a_difference_between_backgrounds_does_not_count_as_variance(data):
@@ -58,15 +60,15 @@ def test_a_difference_between_backgrounds_does_not_count_as_variance(data):
 
 def test_the_misfit_does_not_depend_on_the_unit_of_light(data):
     images = data + 0.01 * torch.randn_like(data)
-    expected = gaussian(images, data, spatial_variance(data))
-    scaled = gaussian(100 * images, 100 * data, spatial_variance(100 * data))
+    expected = GaussianMisfit(data)(images)
+    scaled = GaussianMisfit(100 * data)(100 * images)
     assert scaled.item() == pytest.approx(expected.item(), rel=1e-4)
 
 
 def test_the_misfits_gradient_is_the_scaled_residual(data):
     images = (data + 0.1).requires_grad_()
     variance = spatial_variance(data)
-    gaussian(images, data, variance).backward()
+    GaussianMisfit(data)(images).backward()
     expected = 2 * 0.1 / variance / data.numel()
     assert torch.allclose(images.grad, expected[:, None, None, None].expand_as(data), rtol=1e-4)
 
@@ -85,6 +87,43 @@ def test_uniform_images_are_refused_up_to_rounding(level, shape, dtype):
 def test_a_faint_specimen_is_not_taken_for_a_uniform_image():
     data = 0.5 + 1e-5 * torch.randn(1, 1, 20, 20)
     assert spatial_variance(data).item() == pytest.approx(1e-10, rel=0.3)
+
+
+@pytest.mark.parametrize("kind", [GaussianMisfit, Absolute])
+def test_noise_alone_leaves_what_the_misfit_says(kind):
+    """The images of a perfect model differ from noisy data by the noise."""
+    images = torch.sin(torch.arange(3 * 2 * 60 * 64) * 0.07).reshape(3, 2, 60, 64).double()
+    noise = [0.1, 0.2, 0.05]
+    data = images + torch.tensor(noise).reshape(3, 1, 1, 1) * torch.randn(images.shape, dtype=torch.float64)
+    misfit = kind(data)
+    assert misfit.of_noise(noise) == pytest.approx(misfit(images).item(), rel=0.03)  # 5 standard errors of 7680 pixels
+
+
+def test_a_misfit_divides_by_each_prisms_spatial_variance(data):
+    assert GaussianMisfit(data).variance.shape == (3, 1, 1, 1)
+    assert torch.equal(GaussianMisfit(data).variance.flatten(), spatial_variance(data))
+
+
+def test_data_without_four_axes_are_refused(data):
+    with pytest.raises(ValueError, match=r"the data have shape \(2, 9, 12\)"):
+        GaussianMisfit(data[0])
+
+
+# priors
+
+
+def test_each_prior_is_its_term_of_the_volumes_delta():
+    volume = Volume(Grid((4, 5, 6), (0.4, 0.3, 0.2)), 0.02 * torch.rand(4, 5, 6) - 0.01, 1.5)
+    assert torch.equal(TotalVariation(60.0, 5.0)(volume), total_variation(volume.delta, (0.4, 0.3, 0.2)))
+    assert torch.equal(Magnitude(0.5)(volume), magnitude(volume.delta))
+
+
+def test_each_prior_has_its_own_schedule():
+    annealed, constant = TotalVariation(60.0, 5.0), Magnitude(0.5)
+    assert [annealed.weight(step, 10) for step in range(10)] == [
+        held_then_annealed(s, 10, 60.0, 5.0) for s in range(10)
+    ]
+    assert [constant.weight(step, 10) for step in range(10)] == [0.5] * 10
 
 
 # regularisers

@@ -17,7 +17,8 @@ from recon.cli import main
 from recon.config.conversion import dump
 from recon.config.reading import load
 from recon.fit.planned import GROWTH, current, follow, strength
-from recon.run import reconstruct
+from recon.fit.unknowns import Setup
+from recon.run import recorded
 from torchdic import (
     REFERENCE,
     Acquisition,
@@ -696,17 +697,17 @@ def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypat
     path = write()
     assert run("simulate", path, "--out", tmp_path / "out") == 0
     assert run("reconstruct", path, "--out", tmp_path / "whole") == 0
-    original = reconstruct.descend
+    original = recorded.minimise
 
-    def descend(*arguments):
+    def minimise(*arguments):
         for step in original(*arguments):
             if step.number == 6:  # between two plans
                 raise KeyboardInterrupt
             yield step
 
-    monkeypatch.setattr(reconstruct, "descend", descend)
+    monkeypatch.setattr(recorded, "minimise", minimise)
     assert run("reconstruct", path, "--out", tmp_path / "parts") == 130
-    monkeypatch.setattr(reconstruct, "descend", original)
+    monkeypatch.setattr(recorded, "minimise", original)
     assert run("reconstruct", path, "--out", tmp_path / "parts", "--resume") == 0
     parts, whole = (read_volume(tmp_path / folder / "volume.ome.tif")[0] for folder in ("parts", "whole"))
     assert torch.equal(parts, whole)
@@ -718,10 +719,13 @@ def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypat
 def test_a_volume_is_planned_again_only_once_it_has_doubled():
     grid = Grid((5, 14, 12), (0.5, 0.2, 0.21))
     delta = GaussianBall(0.5, 0.01, 1.5).delta(grid, dtype=torch.float32)
-    rest = grid, 1.5, MICROSCOPE, ACQUISITION, 0.2
-    first = follow((), 0, delta, *rest)
-    assert follow(first, 3, 1.99 * delta, *rest) == first
-    second = follow(first, 5, 2.01 * delta, *rest)
+
+    def followed(plans, step, factor):
+        return follow(plans, step, Setup(Volume(grid, factor * delta, 1.5), MICROSCOPE, ACQUISITION), 0.2)
+
+    first = followed((), 0, 1)
+    assert followed(first, 3, 1.99) == first
+    second = followed(first, 5, 2.01)
     assert second[:1] == first
     assert [made["step"] for made in second] == [1, 6]
     assert isinstance(current(second), Fidelity)

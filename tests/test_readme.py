@@ -8,7 +8,8 @@ import torch
 
 from recon.cli import main
 from recon.config.reading import load
-from recon.run.reconstruct import load_data, reconstruct
+from recon.run.data import load_data
+from recon.run.reconstruct import reconstruct
 from torchdic.files.stack import read_stack
 
 README = Path(__file__).parents[1] / "README.md"

@@ -17,15 +17,17 @@ import pytest
 import tifffile
 import tomli_w
 import torch
+from absolute import Absolute
 from matplotlib import image as pictures
 
 from data_synthetic import GaussianBall
 from recon.cli import main
 from recon.config.reading import load
-from recon.fit.misfit import gaussian, spatial_variance
+from recon.fit.misfit import GaussianMisfit
 from recon.report import figures
 from recon.report.metrics import volume_error
-from recon.run import reconstruct
+from recon.run import reconstruct, recorded, results
+from recon.run.checkpoint import CheckpointError
 from torchdic import Grid, Volume, image
 from torchdic.files.stack import read_stack, read_volume, write_stack
 
@@ -207,13 +209,26 @@ def test_the_metrics_are_those_of_the_volume_left(workplace):
     data = torch.from_numpy(read_stack(workplace / "simulated" / "stack.ome.tif").data)
     with torch.no_grad():
         images = image(Volume(GRID, found, 1.5), config.microscope, config.acquisition, config.fidelity)
-    assert metrics["misfit"] == pytest.approx(gaussian(images, data, spatial_variance(data)).item(), rel=1e-5)
+    assert metrics["misfit"] == pytest.approx(GaussianMisfit(data)(images).item(), rel=1e-5)
     assert metrics["misfit"] < 0.02
     assert metrics["residual_rms"] == pytest.approx(((images - data) ** 2).mean((1, 2, 3)).sqrt().tolist(), rel=1e-4)
     assert metrics["delta"]["max"] == float(found.max())
     assert metrics["steps"] == 60
     assert metrics["propagation"] == "wave"
     assert [report["bias"] for report in metrics["prisms"]] == [1.5, -1.2]
+
+
+def test_another_misfit_is_in_the_metrics_and_the_log_by_its_own_value(other, workplace, tmp_path):
+    path, out = other({"reconstruction": {"steps": 12}}), tmp_path / "out"
+    reconstruct.reconstruct(load(path), out, torch.device("cpu"), misfit=Absolute)
+    config, found = load(path), volume(out)
+    data = torch.from_numpy(read_stack(workplace / "simulated" / "stack.ome.tif").data)
+    with torch.no_grad():
+        images = image(Volume(GRID, found, 1.5), config.microscope, config.acquisition, config.fidelity)
+    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    assert metrics["misfit"] == pytest.approx(Absolute(data)(images).item(), rel=1e-5)
+    log = [float(row["misfit"]) for row in rows(out)]
+    assert metrics["misfit"] < log[-1] < 0.6 * log[0]
 
 
 def test_the_log_has_every_step_once(workplace):
@@ -439,16 +454,16 @@ def interrupt(monkeypatch):
     """A function that makes the next descent stop with KeyboardInterrupt when it would take a step."""
 
     def at(number):
-        original = reconstruct.descend
+        original = recorded.minimise
 
-        def descend(*arguments):
+        def minimise(*arguments):
             for step in original(*arguments):
                 if step.number == number:
-                    monkeypatch.setattr(reconstruct, "descend", original)
+                    monkeypatch.setattr(recorded, "minimise", original)
                     raise KeyboardInterrupt
                 yield step
 
-        monkeypatch.setattr(reconstruct, "descend", descend)
+        monkeypatch.setattr(recorded, "minimise", minimise)
 
     return at
 
@@ -462,15 +477,15 @@ class Doomed:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_signal_is_heeded_where_python_ignores_what_it_raises(other, tmp_path, monkeypatch):
-    original = reconstruct.descend
+    original = recorded.minimise
 
-    def descend(*arguments):
+    def minimise(*arguments):
         for step in original(*arguments):
             yield step
             if step.number == 3:
                 Doomed()
 
-    monkeypatch.setattr(reconstruct, "descend", descend)
+    monkeypatch.setattr(recorded, "minimise", minimise)
     out = tmp_path / "out"
     code, err = command("reconstruct", other({"reconstruction": {"steps": 8}}), "--out", out)
     assert code == 130
@@ -573,6 +588,12 @@ def test_a_changed_configuration_does_not_go_on_with_anothers_run(stopped, other
     assert content(out) == before
 
 
+def test_a_run_with_another_misfit_is_not_gone_on_with(stopped):
+    path, out = stopped
+    with pytest.raises(CheckpointError, match="misfit was gaussian, is absolute"):
+        reconstruct.reconstruct(load(path), out, torch.device("cpu"), resume=True, misfit=Absolute)
+
+
 def test_what_the_descent_does_not_see_may_change_before_it_goes_on(stopped, other, workplace, tmp_path):
     path, out = stopped
     assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0
@@ -613,7 +634,7 @@ def test_a_linear_start_without_a_condenser_prism_is_refused_in_one_line(other, 
     assert "condenser_prism" in err
     assert not (tmp_path / "out").exists()
     zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
-    with pytest.warns(reconstruct.PoorFitWarning):  # two steps, and a stack from a microscope that has the prism
+    with pytest.warns(results.PoorFitWarning):  # two steps, and a stack from a microscope that has the prism
         reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
 
 
@@ -626,7 +647,7 @@ def test_a_linear_start_behind_a_pupil_of_matrices_is_refused_in_one_line(other,
     assert not (tmp_path / "out").exists()
     zero = other({"microscope": microscope, "reconstruction": {"start": "zero", "steps": 2}})
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", reconstruct.PoorFitWarning)  # two steps only
+        warnings.simplefilter("ignore", results.PoorFitWarning)  # two steps only
         reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
     assert (tmp_path / "out" / "volume.ome.tif").exists()
 
@@ -650,7 +671,7 @@ def test_rays_that_turn_are_told_in_one_line(other, tmp_path):
 
 def test_a_volume_that_explains_less_than_empty_medium_is_warned_of(other, tmp_path):
     path = other({"reconstruction": {"steps": 3, "learning_rate": 0.04}})
-    with pytest.warns(reconstruct.PoorFitWarning, match="empty medium would explain the stack better"):
+    with pytest.warns(results.PoorFitWarning, match="empty medium would explain the stack better"):
         reconstruct.reconstruct(load(path), tmp_path / "out", torch.device("cpu"))
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
 from recon.config.schema import ConfigError
 from recon.run.checkpoint import CheckpointError
-from recon.run.reconstruct import InterruptedRunError
+from recon.run.interruption import InterruptedRunError
 from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
 

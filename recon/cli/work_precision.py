@@ -14,8 +14,9 @@ from recon.report import figures
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.run.exact_images import exact_images
 from recon.run.reconstruct import prepare_folder
-from torchdic import STANDARD, Candidate, Fidelity, Trial
+from torchdic import Candidate, Fidelity, Trial
 from torchdic.files.whole import write_json
+from torchdic.planning.comparisons import TRUTH
 from torchdic.planning.ladders import reaches_a_side
 from torchdic.planning.work_precision import converged_fidelities, ladder, trials
 
@@ -32,8 +33,8 @@ def run(options: argparse.Namespace) -> None:
     prepare_folder(options.out)
     exact = None
     if hasattr(specimen, "field"):
-        # the exact field is lit from as many directions as the reference of the default propagation
-        lit = reference[STANDARD.propagation]
+        # the exact field is lit from as many directions as the truth that it replaces
+        lit = reference[TRUTH]
         exact = exact_images(specimen, grid, microscope, acquisition, lit).to(options.device)
     steps = trials(
         volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats

@@ -1,4 +1,4 @@
-"""A learned parameter that runs free, and the Δn within bounds that it stands for."""
+"""Δn within bounds, as a smooth function of a parameter that may take any value."""
 
 import math
 from dataclasses import dataclass
@@ -13,9 +13,10 @@ SHARPNESS = 200.0
 
 @dataclass(frozen=True)
 class Bounds:
-    """Least and greatest Δn; None is no bound. Raises ValueError unless lower < upper.
+    """The least and the greatest Δn. None is no bound. Raises ValueError unless lower < upper.
 
-    A clamp would kill voxels for good once they touch the bound; a smooth map lets them come back.
+    Δn is a smooth function of the parameter, not a clamped one: a voxel that is clamped at a bound has no gradient and
+    can never leave it.
     """
 
     lower: float | None = 0.0
@@ -29,7 +30,7 @@ class Bounds:
             raise ValueError(f"lower bound {self.lower} must be below the upper bound {self.upper}")
 
     def delta(self, parameter: Tensor) -> Tensor:
-        """Δn of a free parameter."""
+        """Δn of a parameter of any value."""
         lower, upper = self.lower, self.upper
         if lower is not None and upper is not None:
             return lower + (upper - lower) * torch.sigmoid(4 * parameter / (upper - lower))
@@ -40,7 +41,7 @@ class Bounds:
         return parameter
 
     def parameter(self, delta: Tensor, margin: float) -> Tensor:
-        """The parameter whose Δn is the given one, kept `margin` away from the bounds so that it can still move."""
+        """The parameter whose Δn is the given one, first moved to at least `margin` (in Δn) from each bound."""
         lower, upper = self.lower, self.upper
         if lower is not None and upper is not None:
             margin = min(margin, (upper - lower) / 4)

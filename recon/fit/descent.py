@@ -1,68 +1,32 @@
 """Adam's descent from a start to the volume that explains the data, as a generator of steps."""
 
-import copy
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.fit.bounds import Bounds
-from recon.fit.misfit import gaussian, spatial_variance
-from recon.fit.planned import PlanRecord, current, follow
-from recon.fit.prior import magnitude, total_variation
-from recon.fit.schedule import cosine, held_then_annealed
-from recon.fit.start import linear_start
-from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
+from recon.fit.planned import PlanRecord
+from recon.fit.problem import Problem, Recipe
+from recon.fit.unknowns import IndexDifference, Setup, State, Unknowns, empty_medium
+from torchdic import Acquisition, Fidelity, Grid, Microscope, image
 from torchdic.errors import UnstableError
 
-# Distance in Δn from its bounds that every voxel starts with.
-MARGIN = 1e-3
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How to descend; the defaults suit specimens with edges, beads and cells.
-
-    steps: of Adam. learning_rate: its first one, in Δn; it falls to 0 along half a cosine. tv: first and last weight of
-    the total variation. l1: weight of the mean |Δn|. bounds: of Δn. start: "linear" or "zero". draft_sources: condenser
-    directions for the first 60 % of the steps, where the fidelity asks for more; None is all of them at once.
-    Raises ValueError where a value breaks its law.
-    """
-
-    steps: int = 150
-    learning_rate: float = 5e-3
-    tv: tuple[float, float] = (60.0, 5.0)
-    l1: float = 0.5
-    bounds: Bounds = field(default_factory=Bounds)
-    start: Literal["linear", "zero"] = "linear"
-    draft_sources: int | None = 24
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"steps {self.steps} must be at least 1")
-        if not (0 < self.learning_rate < math.inf):
-            raise ValueError(f"learning_rate {self.learning_rate} must be above 0")
-        for name, value in (("tv", self.tv[0]), ("tv", self.tv[1]), ("l1", self.l1)):
-            if not (0 <= value < math.inf):
-                raise ValueError(f"{name} {value} must be at least 0")
-        if self.start not in ("linear", "zero"):
-            raise ValueError(f"start {self.start!r} must be 'linear' or 'zero'")
-        if self.draft_sources is not None and self.draft_sources < 1:
-            raise ValueError(f"draft_sources {self.draft_sources} must be at least 1")
+# A step's row of the log: number, misfit, loss, seconds.
+Row = tuple[int, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One step of a descent, and all that is needed to go on from it: nothing in it changes any more.
+    """One step of a descent, and all that is needed to go on from it. Its tensors are not changed afterwards.
 
     number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it.
-    seconds: that the descent has taken, its start included. parameter, optimiser: the learned tensor, Adam's state.
-    plans: all made for a tolerance so far, the last being that of the current fidelity.
+    seconds: that the descent has taken, its start included. values: what every unknown stands for after the step, by
+    name. state: parameters and Adam's moments, by the unknown's name. plans: all that were made for a tolerance so far;
+    the last is that of the current fidelity.
     """
 
     number: int
@@ -70,9 +34,14 @@ class Step:
     loss: float
     delta: Float[Tensor, "z y x"]
     seconds: float
-    parameter: Tensor
-    optimiser: dict[str, Any]
+    values: dict[str, Tensor]
+    state: State
     plans: tuple[PlanRecord, ...] = ()
+
+    @property
+    def row(self) -> Row:
+        """The step's row of the log."""
+        return self.number, self.misfit, self.loss, self.seconds
 
 
 def descend(
@@ -85,88 +54,68 @@ def descend(
     recipe: Recipe,
     resume: Step | None = None,
 ) -> Iterator[Step]:
-    """Fit a volume to images relative to the empty bright field; yields every step.
+    """Fit a volume of Δn to images; yields every step.
 
-    data sets dtype and device. fidelity: or a tolerance of the images, for which one is planned, and again each time
-    the volume has doubled; draft_sources then has no say. resume: the step to go on from; the rest is as if there had
-    been no interruption.
+    data: (prism, focus, y, x), relative to the empty bright field; their dtype and device are the volume's.
+    grid: of the volume. background: index of the medium. microscope, acquisition: what the data were recorded with.
+    fidelity: of the modelled images, or a tolerance of these, for which one is planned, and again each time the volume
+    has doubled; draft_sources then has no say. recipe: how to descend.
+    resume: the step to go on from; the rest is as if there had been no interruption.
     Raises ValueError where the data's shape is not the acquisition's, or FloatingPointError where the fit diverges.
     """
-    expected = (len(acquisition.prisms), len(acquisition.focus), *grid.shape[1:])
-    if tuple(data.shape) != expected:
-        raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}")
+    setup = Setup(empty_medium(grid, background, data), microscope, acquisition)
+    yield from minimise(Problem.from_recipe(data, setup, fidelity, recipe), resume)
+
+
+def minimise(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
+    """Lower the misfit and the priors of a problem by Adam; yields every step.
+
+    resume: the step to go on from; the rest is as if there had been no interruption.
+    Raises ValueError where the step has other unknowns, or FloatingPointError where the fit diverges.
+    """
     started = time.perf_counter()
-    variance = spatial_variance(data)
     if resume is None:
-        first, seconds = 0, 0.0
-        parameter = _start(data, grid, background, microscope, acquisition, recipe)
+        unknowns = Unknowns.at_start(problem.unknowns, problem.setup, problem.misfit)
+        adam, first, seconds, plans = unknowns.adam(), 0, 0.0, ()
     else:
-        first, seconds = resume.number, resume.seconds
-        parameter = resume.parameter.to(data).clone()
-    plans = () if resume is None else resume.plans
-    parameter.requires_grad_(True)
-    adam = torch.optim.Adam([parameter], lr=recipe.learning_rate)
-    if resume is not None:
-        adam.load_state_dict(copy.deepcopy(resume.optimiser))  # Adam works in place
+        unknowns = Unknowns.restored(problem.unknowns, resume.state, problem.misfit.data.device)
+        adam, first, seconds, plans = unknowns.adam(resume.state), resume.number, resume.seconds, resume.plans
 
-    for number in range(first, recipe.steps):
-        adam.param_groups[0]["lr"] = cosine(number, recipe.steps, recipe.learning_rate)
-        delta = recipe.bounds.delta(parameter)
-        if isinstance(fidelity, Fidelity):
-            careful = _draft(fidelity, recipe, number)
-        else:
-            plans = follow(plans, number, delta, grid, background, microscope, acquisition, fidelity)
-            careful = current(plans)
-        try:
-            images = image(Volume(grid, delta, background), microscope, acquisition, careful)
-        except UnstableError as error:
-            raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
-        misfit = gaussian(images, data, variance)
-        loss = misfit
-        tv = held_then_annealed(number, recipe.steps, *recipe.tv)
-        if tv > 0:
-            loss = loss + tv * total_variation(delta, grid.spacing)
-        if recipe.l1 > 0:
-            loss = loss + recipe.l1 * magnitude(delta)
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        misfit, loss = float(misfit.detach()), float(loss.detach())
-        delta = recipe.bounds.delta(parameter.detach().clone())
-        if not math.isfinite(loss) or not bool(torch.isfinite(delta).all()):
-            raise FloatingPointError(f"the descent diverged at step {number + 1}: the loss is {loss:g}")
-        lowest = background + float(delta.min())
-        if lowest <= 0:
-            raise FloatingPointError(f"the descent diverged at step {number + 1}: the index falls to {lowest:g}")
-        yield Step(
-            number + 1,
-            misfit,
-            loss,
-            delta,
-            seconds + time.perf_counter() - started,
-            parameter.detach().clone(),
-            copy.deepcopy(adam.state_dict()),
-            plans,
-        )
+    for step in range(first, problem.steps):
+        unknowns.set_rates(adam, step, problem.steps)
+        misfit, loss, plans = _move(problem, unknowns, adam, step, plans)
+        values = unknowns.values()
+        delta = values.get(IndexDifference.name, problem.setup.volume.delta)
+        _check_convergence(step + 1, loss, values, float(problem.setup.volume.background) + float(delta.min()))
+        taken = seconds + time.perf_counter() - started
+        yield Step(step + 1, misfit, loss, delta, taken, values, unknowns.state(adam), plans)
 
 
-def _start(
-    data: Tensor,
-    grid: Grid,
-    background: float,
-    microscope: Microscope,
-    acquisition: Acquisition,
-    recipe: Recipe,
-) -> Tensor:
-    if recipe.start == "linear":
-        delta = linear_start(data, grid, background, microscope, acquisition)
-    else:
-        delta = data.new_zeros(grid.shape)
-    return recipe.bounds.parameter(delta, margin=MARGIN)
+def _move(
+    problem: Problem, unknowns: Unknowns, adam: torch.optim.Adam, step: int, plans: tuple[PlanRecord, ...]
+) -> tuple[float, float, tuple[PlanRecord, ...]]:
+    """Take one step of Adam; returns the misfit and the loss before it, and the plans so far."""
+    setup = unknowns.into(problem.setup)
+    fidelity, plans = problem.fidelity.at(step, problem.steps, setup, plans)
+    try:
+        images = image(*setup, fidelity)
+    except UnstableError as error:
+        raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
+    misfit = problem.misfit(images)
+    loss = misfit
+    for prior in problem.priors:
+        weight = prior.weight(step, problem.steps)
+        if weight > 0:
+            loss = loss + weight * prior(setup.volume)
+    adam.zero_grad()
+    loss.backward()
+    adam.step()
+    return float(misfit.detach()), float(loss.detach()), plans
 
 
-def _draft(fidelity: Fidelity, recipe: Recipe, number: int) -> Fidelity:
-    drafts = recipe.draft_sources is not None and recipe.draft_sources < fidelity.sources
-    if drafts and number < 0.6 * recipe.steps:
-        return replace(fidelity, sources=recipe.draft_sources)
-    return fidelity
+def _check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:
+    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive."""
+    if not math.isfinite(loss) or not all(bool(torch.isfinite(value).all()) for value in values.values()):
+        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}")
+    if lowest <= 0:
+        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}")

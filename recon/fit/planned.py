@@ -1,48 +1,96 @@
-"""A fidelity that follows a growing volume: planned for a tolerance, and again each time the volume has doubled."""
+"""How carefully the images of each step are computed: with a given fidelity, or with one planned for a tolerance."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
-from torchdic import Acquisition, Fidelity, Grid, Microscope, Plan, Volume, plan
+from recon.fit.unknowns import Setup
+from torchdic import Fidelity, Grid, Plan, plan
 from torchdic.planning.plan import describe
 
-# Growth since the last plan that asks for another.
+# A volume that has grown by this factor since the last plan is planned for again.
 GROWTH = 2.0
 
-# Least |Δn|, and OPD in wavelengths, whose growth counts: a weaker volume is all but empty.
+# Least |Δn|, and least OPD in wavelengths, whose growth counts: a weaker volume is all but empty.
 LEAST_DELTA, LEAST_PATH = 1e-3, 0.02
+
+# Share of the steps that are computed with the draft's condenser directions.
+DRAFT = 0.6
 
 # A plan as plain values, for checkpoints and metrics: number of the step before which it was made, the volume's
 # strength, the plan's error and whether it meets the tolerance, and its fidelity.
 PlanRecord = dict[str, Any]
 
 
+@dataclass(frozen=True)
+class GivenFidelity:
+    """One fidelity for all steps, at first with fewer condenser directions.
+
+    fidelity: of the images. draft_sources: condenser directions of the first 60 % of the steps, where the fidelity asks
+    for more; None is the fidelity's from the first step on.
+    """
+
+    fidelity: Fidelity
+    draft_sources: int | None = None
+
+    def at(
+        self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
+    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+        """The fidelity of a step, counted from 0, and the plans so far, which stay as they are."""
+        draft = self.draft_sources is not None and self.draft_sources < self.fidelity.sources
+        if draft and step < DRAFT * steps:
+            return replace(self.fidelity, sources=self.draft_sources), plans
+        return self.fidelity, plans
+
+    def last(self, plans: tuple[PlanRecord, ...]) -> Fidelity:
+        """The fidelity that the finished volume is judged by."""
+        return self.fidelity
+
+
+@dataclass(frozen=True)
+class PlannedFidelity:
+    """A fidelity that is planned for a tolerance, and again each time the volume's strength has doubled.
+
+    tolerance: rms error of the images over their standard deviation, see `torchdic.plan`.
+    """
+
+    tolerance: float
+
+    def at(
+        self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
+    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+        """The fidelity of a step, counted from 0, and the plans so far with the one made for it."""
+        plans = follow(plans, step, setup, self.tolerance)
+        return current(plans), plans
+
+    def last(self, plans: tuple[PlanRecord, ...]) -> Fidelity:
+        """The fidelity that the finished volume is judged by."""
+        return current(plans)
+
+
 def strength(delta: Tensor, grid: Grid, wavelength: float) -> float:
-    """How strong a volume is: the larger of |Δn| and OPD, each relative to what is all but empty, and at least 1."""
+    """How strong a volume is: the larger of |Δn| and OPD, each over the least that counts, and at least 1.
+
+    delta: Δn (z, y, x). wavelength: µm.
+    """
     delta = delta.detach()
     path = float(delta.sum(0).abs().max()) * grid.spacing[0] / wavelength
     return max(float(delta.abs().max()) / LEAST_DELTA, path / LEAST_PATH, 1.0)
 
 
-def follow(
-    plans: tuple[PlanRecord, ...],
-    number: int,
-    delta: Tensor,
-    grid: Grid,
-    background: float,
-    microscope: Microscope,
-    acquisition: Acquisition,
-    tolerance: float,
-) -> tuple[PlanRecord, ...]:
-    """The plans so far, and one more where the volume has grown GROWTH-fold since the last of them."""
-    now = strength(delta, grid, microscope.wavelength)
+def follow(plans: tuple[PlanRecord, ...], step: int, setup: Setup, tolerance: float) -> tuple[PlanRecord, ...]:
+    """The plans so far, and one more where the volume has grown by GROWTH since the last of them.
+
+    step: counted from 0. setup: with the current volume. tolerance: of the images.
+    """
+    volume, microscope, acquisition = setup
+    now = strength(volume.delta, volume.grid, microscope.wavelength)
     if plans and now < GROWTH * plans[-1]["strength"]:
         return plans
-    made = plan(Volume(grid, delta.detach(), background), microscope, acquisition, tolerance)
+    made = plan(volume, microscope, acquisition, tolerance)
     record = {
-        "step": number + 1,
+        "step": step + 1,
         "strength": now,
         "error": made.error,
         "met": made.met,
@@ -57,11 +105,11 @@ def current(plans: tuple[PlanRecord, ...]) -> Fidelity:
 
 
 def announce(planned: Plan) -> str:
-    """A plan in a line."""
+    """A plan in one line."""
     return f"planned for {planned.tolerance:g}: {describe(planned.fidelity)}; predicted error {planned.error:.2g}"
 
 
 def announce_record(record: PlanRecord) -> str:
-    """A plan of a reconstruction in a line."""
+    """A plan that a descent has made, in one line."""
     fidelity = describe(Fidelity(**record["fidelity"]))
     return f"planned at step {record['step']}: {fidelity}; predicted error {record['error']:.2g}"

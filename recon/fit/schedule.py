@@ -1,4 +1,4 @@
-"""How the learning rate and the weight of total variation change over the steps."""
+"""How a learning rate and the weight of a prior change over the steps of a descent."""
 
 import math
 
@@ -9,7 +9,10 @@ def cosine(step: int, steps: int, peak: float) -> float:
 
 
 def held_then_annealed(step: int, steps: int, first: float, last: float) -> float:
-    """`first` for 40 % of the steps, then geometrically (linearly from or to 0) to `last` over the next 40 %."""
+    """Held at `first` for 40 % of the steps, moved to `last` over the next 40 %, and held there.
+
+    It moves geometrically, or linearly where one of the two weights is 0.
+    """
     progress = min(max((step / steps - 0.4) / 0.4, 0.0), 1.0)
     if first > 0 and last > 0:
         return first * (last / first) ** progress

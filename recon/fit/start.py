@@ -1,6 +1,4 @@
-"""Where a reconstruction begins: the weak specimen that explains the data linearly."""
-
-import math
+"""The start of a reconstruction: the weak specimen whose linear image explains the data."""
 
 import torch
 from jaxtyping import Float
@@ -14,29 +12,21 @@ from torchdic.linear import linear_image, transfer_functions
 DAMPING = 0.03
 
 
-def bytes_of_linear_start(grid: Grid, acquisition: Acquisition, itemsize: int) -> int:
-    """What `linear_start` holds at once, but for its transfer functions' sources, which go in batches.
-
-    The transfer functions and their normal equations, with what is made of them: 4.6 and 8.5 values each, as measured.
-    """
-    slices, *sides = grid.shape
-    images = len(acquisition.prisms) * len(acquisition.focus)
-    return math.ceil((4.6 * images + 8.5 * slices) * slices * math.prod(sides) * itemsize)
-
-
 @torch.no_grad()
 def linear_start(
     data: Float[Tensor, "prism focus y x"],
     grid: Grid,
-    background: float,
+    background: float | Tensor,
     microscope: Microscope,
     acquisition: Acquisition,
     sources: int = 24,
 ) -> Float[Tensor, "z y x"]:
-    """Δn that the model's linear response at Δn = 0 finds behind the data; 0 where it has none, as with bias 0 alone.
+    """Δn whose image, to first order in Δn, is closest to the data; 0 where there is no first order, as with bias 0.
 
-    Frequency by frequency, a damped least-squares problem of the size of the number of slices is solved with the wave's
+    For each lateral frequency a damped least-squares problem with one unknown per slice is solved, with the wave's
     transfer function.
+    data: (prism, focus, y, x), relative to the empty bright field. grid: of the volume. background: index of the
+    medium. sources: condenser directions of the transfer function.
     """
     fidelity = Fidelity("wave", sources=sources)
     empty = Volume(grid, data.new_zeros(grid.shape), background)

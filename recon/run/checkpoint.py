@@ -1,26 +1,28 @@
-"""A descent saved on disk, to go on with after an interruption."""
+"""A descent that is saved on disk, so that it can go on after an interruption."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from recon.fit.descent import Step
+from recon.fit.descent import Row, Step
 from torchdic.files.whole import written_whole
 
-Row = tuple[int, float, float, float]
+# Number of the format that is written and read. Checkpoints of before the second had none.
+FORMAT = 2
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that can't be gone on with: one line with the file and the reason."""
+    """A checkpoint that a run can't go on from: one line with the file and the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
     """A step of a descent and the log up to it.
 
-    step: to go on from. rows: (step, misfit, loss, seconds) of every step so far. identity: what the descent depends
-    on, the resolved configuration and the data's digest, a line `key = value` each.
+    step: to go on from. rows: (number, misfit, loss, seconds) of every step so far. identity: what the descent depends
+    on, that is the resolved configuration, the misfit and the data's digest, one line `key = value` each.
     """
 
     step: Step
@@ -29,20 +31,29 @@ class Checkpoint:
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint, whole or not at all."""
+    """Write a checkpoint. If that fails, an earlier one in the file stays as it was."""
     step = {f.name: getattr(checkpoint.step, f.name) for f in fields(Step)}
+    content = {"format": FORMAT, "step": step, "rows": checkpoint.rows, "identity": checkpoint.identity}
     with written_whole(path) as partial:
-        torch.save({"step": step, "rows": checkpoint.rows, "identity": checkpoint.identity}, partial)
+        torch.save(content, partial)
 
 
 def load(path: Path, identity: str) -> Checkpoint:
-    """Read a checkpoint of the same configuration and data. Raises CheckpointError where it isn't one."""
+    """Read a checkpoint of the same configuration and data, onto the CPU.
+
+    Raises CheckpointError where the file is none, is of an earlier version, or belongs to another descent.
+    """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-        checkpoint = Checkpoint(Step(**content["step"]), content["rows"], content["identity"])
+        earlier = _is_earlier(content)
+        checkpoint = None if earlier else Checkpoint(Step(**content["step"]), content["rows"], content["identity"])
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(f"{path}: is no checkpoint of this version: {reason}") from error
+    if checkpoint is None:
+        raise CheckpointError(
+            f"{path}: is a checkpoint of an earlier version, from which this one can't go on; begin anew with --restart"
+        )
     if checkpoint.identity != identity:
         theirs, ours = _values(checkpoint.identity), _values(identity)
         changed = next(key for key in theirs | ours if theirs.get(key) != ours.get(key))
@@ -51,6 +62,11 @@ def load(path: Path, identity: str) -> Checkpoint:
             f"{changed} was {theirs.get(changed, 'absent')}, is {ours.get(changed, 'absent')}"
         )
     return checkpoint
+
+
+def _is_earlier(content: dict[str, Any]) -> bool:
+    """Whether a file's content is a checkpoint of an earlier format."""
+    return {"step", "rows", "identity"} <= content.keys() and content.get("format", 1) < FORMAT
 
 
 def _values(identity: str) -> dict[str, str]:

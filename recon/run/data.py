@@ -1,0 +1,73 @@
+"""The measured stack that a configuration names, in the model's unit."""
+
+from dataclasses import replace
+
+import torch
+
+from recon.config.schema import Config, ConfigError
+from recon.fit.misfit import spatial_variance
+from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
+from torchdic import Acquisition, Fidelity, Grid, Volume, image
+from torchdic.errors import StackError
+from torchdic.files.stack import read_stack
+
+# Condenser directions of the empty field where the fidelity has yet to be planned.
+MANY_SOURCES = 200
+
+
+def load_data(config: Config) -> Measured:
+    """Read and prepare a configuration's stack: relative to the empty bright field, in the order of its acquisition.
+
+    Raises ConfigError where the configuration has no stack or asks for what can't be reconstructed, and StackError
+    where the file is no stack of its acquisition or shows nothing.
+    """
+    if config.data is None:
+        raise ConfigError("missing key data.path: a reconstruction needs a stack")
+    _check_support(config)
+    section = config.data
+    stack = read_stack(section.path)
+    expected = ExpectedStack(
+        biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
+        focus=tuple(float(focus) for focus in config.acquisition.focus),
+        pixel_size=config.volume.spacing[1:],
+        pixels=config.volume.shape[1:],
+        empty=tuple(_empty_field(config)),
+    )
+    normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
+    measured = prepare(stack, expected, normalisation)
+    try:
+        spatial_variance(torch.from_numpy(measured.data))
+    except ValueError as error:
+        raise StackError(f"{section.path}: {error}") from error
+    return measured
+
+
+def _check_support(config: Config) -> None:
+    """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
+    camera = config.microscope.camera
+    if camera is not None and camera.pixel_size is not None:
+        raise ConfigError(
+            f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
+            "volume's voxels"
+        )
+    sheared = any(prism is not None for prism in config.acquisition.prisms)
+    if sheared and not config.microscope.condenser_prism and config.reconstruction.start == "linear":
+        raise ConfigError(
+            "reconstruction.start: 'linear' needs a condenser prism, microscope.condenser_prism is false; use 'zero'"
+        )
+    if config.microscope.lenses is not None and config.reconstruction.start == "linear":
+        raise ConfigError("reconstruction.start: 'linear' can't hold microscope.polarisation.pupil; use 'zero'")
+
+
+def _empty_field(config: Config) -> list[float]:
+    """Intensity that the model's empty volume has behind each prism, relative to the empty bright field.
+
+    It is sin²(bias/2), and 1 in bright field, where the prisms' light does not leak and none is stopped. It is computed
+    with the condenser directions of the fidelity, or with MANY_SOURCES where the fidelity has yet to be planned.
+    """
+    nothing = torch.zeros(1, 1, 1, dtype=torch.float64)
+    point = Volume(Grid((1, 1, 1), config.volume.spacing), nothing, config.volume.background)
+    fidelity = Fidelity("projection", sources=MANY_SOURCES if config.fidelity is None else config.fidelity.sources)
+    with torch.no_grad():
+        images = image(point, replace(config.microscope, camera=None), Acquisition(config.acquisition.prisms), fidelity)
+    return images.flatten().tolist()

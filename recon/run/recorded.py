@@ -1,0 +1,57 @@
+"""A descent that leaves a log and checkpoints in a folder, so that it may be interrupted and resumed."""
+
+from pathlib import Path
+
+from tqdm import tqdm
+
+from recon.fit.descent import Step, minimise
+from recon.fit.planned import announce_record
+from recon.fit.problem import Problem
+from recon.run import checkpoint
+from recon.run.checkpoint import Checkpoint
+from recon.run.interruption import InterruptedRunError, signals_kept
+from recon.run.log import open_log
+
+LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
+
+
+def descend_recorded(
+    problem: Problem, out: Path, checkpoint_every: int, identity: str, start: Checkpoint | None = None
+) -> Checkpoint:
+    """Take the steps of a problem, with a progress bar; returns the last one, with all rows of the log.
+
+    out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
+    depends on, for the checkpoint. start: to go on from.
+    Raises InterruptedRunError on Ctrl-C or SIGTERM, with a checkpoint of the last step saved; FloatingPointError where
+    the fit diverges.
+    """
+    step: Step | None = None if start is None else start.step
+    rows = [] if start is None else start.rows
+    announced = 0 if step is None else len(step.plans)
+    steps = minimise(problem, step)
+    with (
+        open_log(out / LOG, rows) as log,
+        tqdm(total=problem.steps, initial=len(rows), unit="step") as bar,
+        signals_kept() as check_signals,
+    ):
+        try:
+            for step in steps:
+                log.add(step.row)
+                for record in step.plans[announced:]:
+                    tqdm.write(announce_record(record))
+                announced = len(step.plans)
+                bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
+                bar.update()
+                if step.number % checkpoint_every == 0:
+                    checkpoint.save(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
+                check_signals()
+        except KeyboardInterrupt:
+            if step is None:
+                raise InterruptedRunError("interrupted before the first step") from None
+            log.add(step.row)  # the signal may have come between the step and its row
+            checkpoint.save(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
+            raise InterruptedRunError(
+                f"interrupted after step {step.number} of {problem.steps}; go on with --resume"
+            ) from None
+        assert step is not None
+        return Checkpoint(step, log.rows, identity)

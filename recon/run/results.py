@@ -1,0 +1,98 @@
+"""What a finished reconstruction leaves in its folder: the volume, metrics, configuration and figures."""
+
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.config.conversion import dump
+from recon.config.schema import Config
+from recon.fit.descent import Step
+from recon.fit.planned import announce_record
+from recon.fit.problem import Problem
+from recon.fit.unknowns import with_values
+from recon.recording.preparation import Measured, PrismReport
+from recon.report import figures
+from recon.report.metrics import residual_rms
+from recon.run.checkpoint import Checkpoint
+from torchdic import image
+from torchdic.files.stack import write_volume
+from torchdic.files.whole import write_json, write_text
+
+
+class PoorFitWarning(UserWarning):
+    """The volume that a descent found explains its data less well than empty medium does."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a reconstruction leaves: Δn (z, y, x) and its metrics, as in metrics.json."""
+
+    delta: Float[Tensor, "z y x"]
+    metrics: dict[str, object]
+
+
+@torch.no_grad()
+def model_images(problem: Problem, last: Step) -> Float[Tensor, "prism focus y x"]:
+    """The images of a descent's last step, computed with its last fidelity."""
+    values = {name: value.to(problem.misfit.data.device) for name, value in last.values.items()}
+    return image(*with_values(problem.unknowns, values, problem.setup), problem.fidelity.last(last.plans))
+
+
+def metrics(
+    problem: Problem, last: Step, images: Float[Tensor, "prism focus y x"], reports: tuple[PrismReport, ...]
+) -> dict[str, Any]:
+    """The numbers of metrics.json.
+
+    images: the model's, of the last step. reports: what the preparation found in each prism's measured images, such as
+    the standard deviation of their noise.
+    """
+    noise = [report.noise for report in reports if report.noise is not None]
+    found: dict[str, Any] = {
+        "propagation": problem.fidelity.last(last.plans).propagation,
+        "misfit": float(problem.misfit(images)),
+        "noise_misfit": problem.misfit.of_noise(noise) if len(noise) == len(reports) else None,
+        "residual_rms": residual_rms(images, problem.misfit.data),
+        "steps": last.number,
+        "seconds": round(last.seconds, 3),
+        "delta": {"min": float(last.delta.min()), "max": float(last.delta.max()), "mean": float(last.delta.mean())},
+        "prisms": [asdict(report) for report in reports],
+    }
+    if last.plans:
+        found["plans"] = list(last.plans)
+    return found
+
+
+def warn_of_poor_fit(misfit: float) -> None:
+    """Warn PoorFitWarning where empty medium would explain the stack better than the volume that was found.
+
+    misfit: of that volume.
+    """
+    if misfit > 1:
+        warnings.warn(
+            f"the misfit {misfit:.3g} is above 1: empty medium would explain the stack better; "
+            "a smaller learning_rate or more tv may help",
+            PoorFitWarning,
+            stacklevel=3,
+        )
+
+
+def write_results(out: Path, config: Config, measured: Measured, problem: Problem, ended: Checkpoint) -> Result:
+    """Write a finished descent's volume, metrics, resolved configuration and figures into a folder."""
+    last, grid = ended.step, config.volume.grid
+    images, data, delta = model_images(problem, last), problem.misfit.data.cpu(), last.delta.cpu()
+    found = metrics(problem, last, images, measured.prisms)
+    warn_of_poor_fit(found["misfit"])
+    write_volume(out / "volume.ome.tif", delta, grid)
+    comments = "".join(f"# {announce_record(record)}\n" for record in last.plans)
+    write_text(out / "config.resolved.toml", comments + dump(config))
+    write_json(out / "metrics.json", found)
+    drawn = figures.draw_images(data, images.cpu(), config.acquisition.prisms, measured.focus, grid)
+    figures.save(drawn, out / "images.png")
+    figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
+    figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
+    return Result(delta, found)

@@ -1,0 +1,81 @@
+"""Whether there is room for a descent, found before it begins."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from recon.fit.descent import minimise
+from recon.fit.misfit import Misfit
+from recon.fit.planned import GivenFidelity
+from recon.fit.problem import Problem
+from recon.fit.unknowns import Setup, empty_medium
+from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
+from torchdic.memory.free import check_room, check_volume, free_bytes
+from torchdic.memory.held import course_of, most
+from torchdic.memory.signature import stand_in
+
+# Pixels along a side of the sample that is measured, and steps of its descent: the last of them hold what all hold.
+SIDE, STEPS = 40, 3
+# Arrays of the volume's size that any descent holds: Δn, its gradient and Adam's two moments.
+ARRAYS = 4
+
+
+def check_room_for_volume(grid: Grid, device: torch.device) -> None:
+    """Raise ShortOfMemoryError where not even the descent's own arrays would have room."""
+    check_volume(grid, ARRAYS, device)
+
+
+def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> None:
+    """Raise ShortOfMemoryError where a descent would take more memory than is free.
+
+    misfit: makes the problem's misfit from data. Where the fidelity has yet to be planned, nothing is checked: each
+    image is, when it is computed.
+    """
+    if not isinstance(problem.fidelity, GivenFidelity):
+        return
+    fidelity, data = problem.fidelity.fidelity, problem.misfit.data
+    images = foreseen(*problem.setup, fidelity, gradient=True).least
+    wanted = images + held_beside_images(problem, misfit, fidelity)
+    shape = "×".join(map(str, problem.setup.volume.grid.shape))
+    check_room(wanted, free_bytes(data.device), f"Steps of a reconstruction of {shape} voxels")
+
+
+def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fidelity: Fidelity) -> int:
+    """Bytes that a descent holds beside an image and its gradient: measured on few pixels, scaled to the problem's.
+
+    They are those of the unknowns and what they are made of, Adam's moments, the priors, the steps that are handed out,
+    and the start.
+    """
+    grid = problem.setup.volume.grid
+    few = replace(grid, shape=(grid.shape[0], *(min(n, SIDE) for n in grid.shape[1:])))
+    shape = *problem.misfit.data.shape[:2], *few.shape[1:]
+    # values play no part, but images of one brightness are refused
+    data = torch.rand(shape, dtype=problem.misfit.data.dtype, generator=torch.Generator().manual_seed(0))
+    medium = empty_medium(few, float(problem.setup.volume.background), data)
+    microscope = stand_in(_of_one_source(problem.setup.microscope))
+    setup = Setup(medium, microscope, stand_in(problem.setup.acquisition))
+    ample = replace(fidelity, memory=1 << 62)
+    sample = replace(problem, setup=setup, misfit=misfit(data), fidelity=GivenFidelity(ample), steps=STEPS)
+
+    def descend() -> None:
+        last = None
+        for step in minimise(sample):
+            last = step  # held while the next one is computed, as a caller's loop does
+        del last
+
+    def compute_image() -> None:
+        learned = torch.zeros(few.shape, dtype=data.dtype, requires_grad=True)
+        volume = Volume(few, learned, medium.background)
+        image(volume, microscope, setup.acquisition, ample).sum().backward()
+
+    beside = most(course_of(descend)) - most(course_of(compute_image))
+    return math.ceil(beside * math.prod(grid.shape[1:]) / math.prod(few.shape[1:]))
+
+
+def _of_one_source(microscope: Microscope) -> Microscope:
+    """A microscope with one direction of its light, whose images hold least beside the descent."""
+    points, _ = microscope.sources(1, dtype=torch.float64)
+    return microscope.lit_from(points[:1])

@@ -1,0 +1,154 @@
+import math
+from dataclasses import dataclass, fields, replace
+
+import pytest
+import torch
+
+from data_synthetic import GaussianBall
+from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
+from recon.fit.misfit import GaussianMisfit
+from recon.fit.problem import Problem, Recipe
+from recon.fit.unknowns import IndexDifference, Setup, Unknown, Unknowns, empty_medium
+from recon.report.metrics import volume_error
+from recon.run import checkpoint
+from recon.run.checkpoint import Checkpoint
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+
+BACKGROUND = 1.5
+GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
+MICROSCOPE = Microscope(0.546, Objective(0.8), Condenser(0.5))
+FIDELITY = Fidelity(sources=6)
+TRUE = Acquisition([Prism((0.0, 0.24), 1.5), Prism((0.24, 0.0), -1.2)], [-1.0, 0.0, 1.0])
+OFF = math.radians(10)
+DECLARED = Acquisition([replace(prism, bias=prism.bias + OFF) for prism in TRUE.prisms], TRUE.focus)
+
+
+@dataclass(frozen=True)
+class BiasOffset(Unknown):
+    """What is added to the bias of every prism, rad: an unknown that the toolbox doesn't have, as a user adds one."""
+
+    learning_rate: float
+    name = "bias offset"
+
+    def start(self, setup, misfit):
+        return torch.zeros((), dtype=misfit.data.dtype)
+
+    def put(self, value, setup):
+        prisms = [replace(prism, bias=prism.bias + value) for prism in setup.acquisition.prisms]
+        return setup._replace(acquisition=Acquisition(prisms, setup.acquisition.focus))
+
+
+@pytest.fixture
+def truth():
+    return GaussianBall(0.5, 0.02, BACKGROUND, (0.3, -0.3, 0.4)).delta(GRID, dtype=torch.float32)
+
+
+@pytest.fixture
+def data(truth):
+    with torch.no_grad():
+        return image(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, FIDELITY)
+
+
+def problem(data, acquisition, *more, steps=40):
+    """Δn, and more unknowns beside it, sought behind the data with an acquisition that may be wrong."""
+    setup = Setup(empty_medium(GRID, BACKGROUND, data), MICROSCOPE, acquisition)
+    recipe = Recipe(steps=steps, start="zero", tv=(20.0, 5.0), draft_sources=None)
+    made = Problem.from_recipe(data, setup, FIDELITY, recipe)
+    return replace(made, unknowns=[*made.unknowns, *more])
+
+
+def same(a, b):
+    """Bit for bit, dicts and tensors alike."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+
+
+def alike(a, b):
+    """Whether two steps are bit for bit the same, but for their seconds."""
+    return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.name != "seconds")
+
+
+def test_a_bias_that_is_10_degrees_off_is_found_beside_the_volume(data, truth):
+    *_, right = minimise(problem(data, TRUE))
+    *_, wrong = minimise(problem(data, DECLARED))
+    *_, learned = minimise(problem(data, DECLARED, BiasOffset(0.05)))
+    assert learned.values["bias offset"].item() == pytest.approx(-OFF, abs=math.radians(0.5))
+    assert volume_error(wrong.delta, truth) > 2 * volume_error(right.delta, truth)
+    assert volume_error(learned.delta, truth) < 1.05 * volume_error(right.delta, truth)
+
+
+def test_each_unknown_has_its_own_learning_rate(data):
+    """Adam's first step is as long as the learning rate."""
+    step = next(minimise(problem(data, DECLARED, BiasOffset(0.05))))
+    assert step.values["bias offset"].item() == pytest.approx(-0.05, rel=1e-3)
+    start = Bounds().parameter(torch.zeros(GRID.shape), margin=1e-3)
+    moved = (step.state["delta"]["parameter"] - start).abs()
+    assert moved.max().item() == pytest.approx(5e-3, rel=1e-3)
+
+
+def test_a_descent_of_two_unknowns_goes_on_from_disk_bit_for_bit(data, tmp_path):
+    two = problem(data, DECLARED, BiasOffset(0.05), steps=10)
+    steps = list(minimise(two))
+    for step in steps[3], steps[7]:
+        checkpoint.save(tmp_path / "checkpoint.pt", Checkpoint(step, [], ""))
+        again = checkpoint.load(tmp_path / "checkpoint.pt", "").step
+        assert alike(again, step)
+        rest = list(minimise(two, again))
+        assert len(rest) == 10 - step.number
+        assert all(alike(a, b) for a, b in zip(rest, steps[step.number :], strict=True))
+
+
+def test_a_problem_can_be_solved_again(data):
+    two = problem(data, DECLARED, BiasOffset(0.05), steps=4)
+    assert all(alike(a, b) for a, b in zip(minimise(two), minimise(two), strict=True))
+
+
+def test_a_step_of_other_unknowns_is_refused_with_their_names(data):
+    step = next(minimise(problem(data, DECLARED)))
+    with pytest.raises(ValueError, match="the saved step has the unknowns delta, the descent has delta, bias offset"):
+        next(minimise(problem(data, DECLARED, BiasOffset(0.05)), step))
+
+
+def test_two_unknowns_of_one_name_are_refused(data):
+    with pytest.raises(ValueError, match="two unknowns share a name: delta, bias offset, bias offset"):
+        problem(data, DECLARED, BiasOffset(0.05), BiasOffset(0.03))
+
+
+def test_the_bias_alone_is_found_where_the_volume_is_known(data, truth):
+    setup = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, DECLARED)
+    known = replace(problem(data, DECLARED), setup=setup, unknowns=[BiasOffset(0.05)], priors=[])
+    *_, last = minimise(known)
+    assert last.values["bias offset"].item() == pytest.approx(-OFF, abs=math.radians(0.5))
+    assert torch.equal(last.delta, truth)
+    assert last.misfit < 0.01
+
+
+def test_values_are_put_where_they_belong_and_keep_their_graph(data):
+    two = problem(data, DECLARED, BiasOffset(0.05))
+    unknowns = Unknowns.at_start(two.unknowns, two.setup, two.misfit)
+    volume, microscope, acquisition = unknowns.into(two.setup)
+    assert volume.delta.requires_grad
+    assert torch.equal(volume.delta.detach(), unknowns.values()["delta"])
+    assert microscope is MICROSCOPE
+    assert [float(prism.bias.detach()) for prism in acquisition.prisms] == pytest.approx(
+        [prism.bias for prism in DECLARED.prisms]
+    )
+    assert not any(value.requires_grad for value in unknowns.values().values())
+
+
+def test_a_known_absorption_stays_where_delta_is_put(data):
+    absorption = torch.full(GRID.shape, 1e-3)
+    setup = Setup(Volume(GRID, torch.zeros(GRID.shape), BACKGROUND, absorption), MICROSCOPE, TRUE)
+    unknown = IndexDifference(5e-3, Bounds(), "zero")
+    delta = unknown.value(unknown.start(setup, GaussianMisfit(data)))
+    put = unknown.put(delta, setup).volume
+    assert put.delta is delta
+    assert torch.equal(put.absorption, absorption)
+    assert float(put.background) == BACKGROUND
+
+
+def test_an_empty_medium_takes_no_memory_for_its_voxels():
+    medium = empty_medium(Grid((100, 100, 100), (0.5, 0.2, 0.2)), BACKGROUND, torch.zeros(1, dtype=torch.float64))
+    assert medium.delta.untyped_storage().nbytes() == 8
