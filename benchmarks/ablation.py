@@ -30,9 +30,9 @@ from torchdic.imaging.passband import interpolate
 from torchdic.object_aberration.levels import levels
 from torchdic.object_aberration.wavefront import effective_defocus
 from torchdic.plane_waves import axial_difference, axial_momentum, exp_i, to_field, to_spectrum
-from torchdic.propagation import bent_rays
-from torchdic.propagation.projection import project
-from torchdic.propagation.wave import slab_mean
+from torchdic.propagation.base import propagation_of
+from torchdic.propagation.split_step import slab_mean
+from torchdic.rays import landing
 from torchdic.rays.trace import Deviation
 
 Name = Literal["rays", "no p_z", "no amplitude", "at the exit", "textbook screen", "split step"]
@@ -42,7 +42,7 @@ Name = Literal["rays", "no p_z", "no amplitude", "at the exit", "textbook screen
 def without_axial_momentum() -> Iterator[None]:
     """Rays of amplitude 1/√|det ∂x_r/∂x0|: `ray_field` with its factor p_z/p_z0 divided out again."""
     slants: list[Tensor] = []
-    extend, tube_area = bent_rays.extend, bent_rays.tube_area
+    extend, tube_area = landing.extend, landing.tube_area
 
     def extended(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviation:
         landed = extend(rays, p0, n0, distance)
@@ -52,7 +52,7 @@ def without_axial_momentum() -> Iterator[None]:
     def area(displacement: Tensor, grid: Grid) -> Tensor:
         return tube_area(displacement, grid) / slants.pop()
 
-    with mock.patch.object(bent_rays, "extend", extended), mock.patch.object(bent_rays, "tube_area", area):
+    with mock.patch.object(landing, "extend", extended), mock.patch.object(landing, "tube_area", area):
         yield
 
 
@@ -112,15 +112,19 @@ def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMet
     momentum, weights = microscope.sources(rays.sources, dtype=torch.float32, device=volume.delta.device)
     half_angle = math.asin(microscope.condenser.na / float(n0)) if method == "cone" else None
     careful = Fidelity("rays", interpolation="cubic", steps=rays.steps)
-    field = project if rays.propagation == "projection" else bent_rays.ray_field
     with torch.no_grad():
         defocus = times * effective_defocus(volume, plane, fidelity=careful, method=method, half_angle=half_angle)
         rate = float(n0 - (n0**2 - microscope.objective.na**2).sqrt()) * 2 * math.pi / microscope.wavelength
         difference, _ = axial_difference(volume.grid, microscope.wavelength, n0, momentum)
-        at_plane = field(volume, microscope.wavelength, momentum, plane, rays)
-        spectrum = levels(defocus, rate).spread(at_plane, microscope.wavelength, difference)
+        own = levels(defocus, rate)
+        crossing = propagation_of(rays).prepare(volume, rays, plane)
+        spectrum = crossing.spectrum(
+            microscope.wavelength,
+            momentum,
+            to_spectrum=lambda field: own.spread(field, microscope.wavelength, difference),
+        )
         imaging = Imaging(volume.grid, n0, plane, microscope, scene.acquisition)
-        images = imaging.intensity(spectrum[:, None], momentum, weights)
+        images = imaging.intensity(spectrum, momentum, weights)
     return scene.errors(interpolate(images, (volume.grid.shape[1], volume.grid.shape[2])))
 
 

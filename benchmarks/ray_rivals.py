@@ -49,7 +49,7 @@ class Torchdic:
         """Deviation and OPD as tensors."""
         from torchdic.rays.trace import deviation
 
-        change = deviation(self.volume, self.rays, self.fidelity)
+        change = deviation(self.volume.sampled(self.fidelity.interpolation), self.rays, self.fidelity)
         return change.position.T, change.opd
 
     def forward(self) -> tuple[np.ndarray, np.ndarray]:

@@ -5,16 +5,16 @@ import math
 
 import pytest
 import torch
+from through import deviation, ray_field, tubes_that_may_fold
 
 from data_synthetic import GaussianBall
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.plane_waves import to_field
-from torchdic.propagation import bent_rays
-from torchdic.propagation.bent_rays import ray_field
-from torchdic.propagation.wave import split_step
-from torchdic.rays.caustics import Tubes, tubes_that_may_fold
-from torchdic.rays.mesh import MARGIN
-from torchdic.rays.trace import deviation, launch
+from torchdic.propagation.split_step import split_step
+from torchdic.rays import landing
+from torchdic.rays.caustics import Tubes
+from torchdic.rays.mesh import SURROUND
+from torchdic.rays.trace import launch
 
 N0 = 1.5
 AXIAL = torch.zeros(1, 2, dtype=torch.float64)
@@ -40,7 +40,7 @@ def apodised(volume, waist, wavelength):
 def passed(volume, momentum=AXIAL, fidelity=CUBIC):
     tubes = tubes_that_may_fold(volume, momentum, fidelity)
     assert tubes is not None
-    deviation(volume, launch(volume.grid, momentum, volume.background, 0.0, MARGIN), fidelity, watch=tubes)
+    deviation(volume, launch(volume.grid, momentum, volume.background, 0.0, SURROUND), fidelity, watch=tubes)
     return tubes.passed()
 
 
@@ -146,7 +146,7 @@ def test_image_of_a_ball_that_focuses_inside_the_volume_is_the_waves(monkeypatch
 
     waves = of(Fidelity("wave"))
     error = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
-    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: None)
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
     without = ((of(CUBIC) - waves).square().mean((2, 3)).sqrt() / waves.std((2, 3)))[0]
     assert float(error.max()) < 0.01
     assert float(without.min()) > 0.5
@@ -194,7 +194,7 @@ def test_no_fold_escapes_the_bound_and_it_is_not_much_too_wary(interpolation, mo
             tubes(state)
             least.append(float(tubes._area.min()))
 
-        deviation(volume, launch(volume.grid, source, volume.background, 0.0, MARGIN), fidelity, watch=watch)
+        deviation(volume, launch(volume.grid, source, volume.background, 0.0, SURROUND), fidelity, watch=watch)
         return min(least) <= 0
 
     def onset(happens):
@@ -224,7 +224,7 @@ def test_bound_holds_where_index_meets_the_sides(smooth_field, interpolation):
                     continue
                 free += 1
                 tubes, areas = Tubes(grid, 1.0), []
-                start = launch(grid, source, volume.background, 0.0, MARGIN)
+                start = launch(grid, source, volume.background, 0.0, SURROUND)
                 deviation(volume, start, fidelity, watch=lambda s, t=tubes, a=areas: (t(s), a.append(t._area.min())))
                 assert float(torch.stack(areas).min()) > 0
     assert free > 10
@@ -251,7 +251,7 @@ def test_looking_changes_no_bit_where_nothing_folds(monkeypatch, smooth_field, d
         return field, gradient
 
     plain = of()
-    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda volume, *_: Tubes(volume.grid, 1.0))
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda volume, *_: Tubes(volume.grid, 1.0))
     found = of()
     assert torch.equal(found[0], plain[0])
     # slabs' gradients are added up in another order

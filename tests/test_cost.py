@@ -27,7 +27,7 @@ from torchdic import (
 )
 from torchdic.imaging import polarised
 from torchdic.object_aberration.levels import object_levels
-from torchdic.propagation import bent_rays
+from torchdic.rays import landing
 from torchdic.rays.caustics import Tubes
 from torchdic.specimen.interpolation import SliceSampler
 
@@ -62,7 +62,7 @@ def counted(monkeypatch):
         watch(torch.fft, name)
     for name in ("sample", "value"):
         watch(SliceSampler, name)
-    watch(bent_rays, "tube_area")
+    watch(landing, "tube_area")
 
     def count(function):
         calls.clear()
@@ -317,10 +317,7 @@ def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level
     found = object_levels(
         Volume(GRID, delta, N0),
         0.0,
-        0.546,
-        SCOPE.objective,
-        SCOPE.condenser,
-        POINTS,
+        SCOPE,
         Fidelity(**options, object_aberration=method),
     )
     assert extra == map_ + Counter(fft2=len(found.defocus) - 1)
@@ -351,7 +348,7 @@ def test_caustics_are_not_counted_where_a_bound_rules_them_out(delta, counted, m
     """Rays through a smooth specimen are followed from face to face as if there were no such thing."""
     function = taking(delta, propagation="rays")
     cost, most, images = counted(function), peak(function), function()
-    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: None)
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: None)
     assert counted(function) == cost
     assert torch.equal(function(), images)
     assert peak(function) == most
@@ -365,7 +362,7 @@ def test_counting_caustics_takes_neither_transforms_nor_evaluations(delta, count
     looked = []
     look = Tubes.__call__
     monkeypatch.setattr(Tubes, "__call__", lambda self, state: looked.append(1) or look(self, state))
-    monkeypatch.setattr(bent_rays, "tubes_that_may_fold", lambda *_: Tubes(GRID, 1.0))
+    monkeypatch.setattr(landing, "tubes_that_may_fold", lambda *_: Tubes(GRID, 1.0))
     assert counted(plain) == cost
     assert len(looked) == SLICES
     assert torch.equal(plain(), images)

@@ -10,14 +10,13 @@ from itertools import pairwise
 
 import pytest
 import torch
+from through import deviation, propagate, ray_field
 
 from data_synthetic import GaussianBall
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Prism, Volume, image
-from torchdic.forward.images import propagate
 from torchdic.plane_waves import axial_difference, axial_momentum
-from torchdic.propagation import bent_rays
-from torchdic.propagation.bent_rays import ray_field
-from torchdic.rays.trace import deviation, launch
+from torchdic.rays import landing
+from torchdic.rays.trace import launch
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -110,7 +109,7 @@ def test_flux_through_a_face_behind_a_focus_is_the_incoming_one(monkeypatch):
     """
     # A² instead of A·exp(ikW), and p_z/p_z0 divided out: 1/|det| is A²p_z/p_z0. On the face nothing is extended.
     monkeypatch.setattr(torch, "polar", lambda amplitude, phase: torch.complex(amplitude.square(), 0 * phase))
-    monkeypatch.setattr(bent_rays, "axial_momentum", lambda n0, p: torch.ones_like(p[..., 0]))
+    monkeypatch.setattr(landing, "axial_momentum", lambda n0, p: torch.ones_like(p[..., 0]))
     momentum = torch.tensor([[0.0, 0.0], [0.12, -0.16]], dtype=torch.float64)
     for n in (30, 60, 90):
         volume = leaving(n, 0.11, 7.0)
@@ -163,7 +162,7 @@ def test_weak_absorber_of_any_shape_takes_its_cross_section(propagation, interpo
     torch.testing.assert_close(lost, expected, rtol=1e-3, atol=0)
 
 
-@pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
+@pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 def test_prisms_two_outputs_share_all_light_in_any_focus(smooth_field, propagation):
     """Without a pupil, bias b and bias b + π add up to the bright field, and no focus plane gains or loses light."""
     grid = Grid((4, 15, 18), (0.4, 0.2, 0.21))

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from through import propagate
 
 from torchdic import Fidelity, Grid, Volume
-from torchdic.forward.images import propagate
 from torchdic.plane_waves import axial_difference, exp_i, to_field
 
 

@@ -6,18 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchdic import (
-    Acquisition,
-    Condenser,
-    Fidelity,
-    Grid,
-    Microscope,
-    Objective,
-    Prism,
-    Volume,
-    image,
-    image_field,
-)
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
 
 GRID = Grid((3, 8, 9), (0.6, 0.22, 0.2))
 POINTS = torch.tensor([[0.0, 0.0], [0.31, -0.12], [-0.17, 0.24], [0.05, 0.38]], dtype=torch.float64)

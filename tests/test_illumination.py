@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from through import propagate
 
 from data_synthetic import Bead
 from recon.config.conversion import dump
@@ -26,7 +27,6 @@ from torchdic import (
     image,
     image_field,
 )
-from torchdic.forward.images import propagate
 from torchdic.linear import linear_image
 from torchdic.plane_waves import axial_difference, exp_i, to_field
 

@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
+from through import deviation, ray_field
 
 from data_synthetic import GaussianBall
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, launch
-from torchdic.propagation.bent_rays import extend, ray_field, tube_area
-from torchdic.rays.mesh import MARGIN, Mesh, crossed_caustics
-from torchdic.rays.trace import Deviation, deviation
+from torchdic.rays.landing import extend, tube_area
+from torchdic.rays.mesh import SURROUND, Mesh, crossed_caustics
+from torchdic.rays.trace import Deviation
 
 N0 = 1.36
 WAVELENGTH = 0.546
@@ -31,7 +32,7 @@ def coverage(grid, displacement):
 
 
 def rays_at_home(grid, dtype=torch.float64):
-    ny, nx = grid.shape[1] + 2 * MARGIN, grid.shape[2] + 2 * MARGIN
+    ny, nx = grid.shape[1] + 2 * SURROUND, grid.shape[2] + 2 * SURROUND
     y, x = (
         ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * d).to(dtype)
         for n, d in ((ny, grid.spacing[1]), (nx, grid.spacing[2]))
@@ -285,7 +286,7 @@ def test_field_carries_the_turn_of_its_rays(smooth_field):
     momentum = torch.tensor([[0.3, -0.2], [-0.5, 0.4]], dtype=torch.float64)
     fidelity = Fidelity("rays")
     plain = ray_field(volume, WAVELENGTH, momentum, 0.3, fidelity)
-    turned = ray_field(volume, WAVELENGTH, momentum, 0.3, fidelity, turned=True)
+    turned = ray_field(volume, WAVELENGTH, momentum, 0.3, fidelity, polarised=True)
     assert turned.shape == (2, 2, 20, 22)
     assert float(turned[:, 1].abs().max()) > 1e-3
     found = (turned[:, 1] / turned[:, 0]).real.atan()
@@ -311,7 +312,7 @@ def test_gradient_of_a_turned_field_is_the_central_difference(smooth_field):
     weights = torch.randn(2, 2, 8, 9, dtype=torch.complex128)
 
     def of(delta):
-        field = ray_field(Volume(grid, delta, N0), WAVELENGTH, momentum, 0.3, Fidelity("rays"), turned=True)
+        field = ray_field(Volume(grid, delta, N0), WAVELENGTH, momentum, 0.3, Fidelity("rays"), polarised=True)
         return (weights * field).real.sum()
 
     value = delta.clone().requires_grad_()

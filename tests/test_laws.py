@@ -6,21 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from through import propagate
 
 from data_synthetic import GaussianBall
-from torchdic import (
-    Acquisition,
-    Condenser,
-    Fidelity,
-    Grid,
-    Microscope,
-    Objective,
-    Prism,
-    Volume,
-    image,
-    image_field,
-)
-from torchdic.forward.images import propagate
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
 
 WAVELENGTH = 0.546
 N0 = 1.36

@@ -35,11 +35,11 @@ from torchdic import (
     ToleranceWarning,
     Volume,
     image,
-    pilots,
     plan,
 )
 from torchdic.errors import UnstableError, WrapAroundWarning
 from torchdic.files.stack import read_volume
+from torchdic.planning import pilots
 from torchdic.planning.cost import work
 from torchdic.planning.image_error import FLOOR, image_error
 from torchdic.planning.ladders import MARGIN, way_ladder

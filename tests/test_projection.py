@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from through import project
 
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
-from torchdic.propagation.projection import project
 
 N0 = 1.36
 

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
-from torchdic.propagation.wave import MOST_ENERGY
+from torchdic.propagation.split_step import MOST_ENERGY
 
 REFUSALS = (TurnedRaysError, SidewaysError, UnstableError)
 everywhere = pytest.mark.parametrize("propagation", ["projection", "rays", "wave"])
 coarse = pytest.mark.filterwarnings(
     "ignore::torchdic.SamplingWarning",
-    "ignore::torchdic.wrap_around.WrapAroundWarning",
-    "ignore::torchdic.wave.SlabWarning",
+    "ignore::torchdic.errors.WrapAroundWarning",
+    "ignore::torchdic.errors.SlabWarning",
 )
 # the same examples every time: a failure is the code's, not the day's
 few = settings(

@@ -11,7 +11,6 @@ from torchdic import Fidelity, Grid
 from torchdic.memory.batches import recompute
 from torchdic.rays.equation import RayEquation
 from torchdic.rays.solver import TABLEAUX, solve
-from torchdic.rays.trace import kept_by_rays
 from torchdic.specimen.interpolation import SliceSampler, spline_coefficients
 
 GRID = Grid((5, 7, 6), (0.5, 0.3, 0.4))
@@ -116,26 +115,6 @@ def test_backward_pass_keeps_where_a_step_began_and_what_it_sampled_and_nothing_
     value = at_first_face(equation)[0].nbytes
     # δy, δx and their momenta; of 4 stages Δn with its gradient, and κ
     assert sum(size for pointer, size in kept.items() if pointer not in own) == 8 * (4 + 4 * 4) * value
-
-
-@pytest.mark.parametrize("solver", TABLEAUX)
-@pytest.mark.parametrize("absorbing", [False, True])
-def test_kept_by_rays_is_what_is_kept(solver, absorbing):
-    """The estimate that decides whether slabs are recomputed."""
-    equation, _ = problem(absorbing=absorbing)
-    depths = torch.linspace(-1.25, 1.25, 9, dtype=torch.float64)
-    kept = {}
-
-    def keep(tensor):
-        kept[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        return tensor
-
-    fidelity = Fidelity("rays", solver=solver, steps=8)
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        solve(equation, at_first_face(equation), depths, fidelity)
-    own = {t.untyped_storage().data_ptr() for t in equation.tensors}
-    values = sum(size for pointer, size in kept.items() if pointer not in own) / at_first_face(equation)[0].nbytes
-    assert values == kept_by_rays(GRID, fidelity, absorbs=absorbing)
 
 
 def test_nothing_is_kept_where_nothing_is_learned():

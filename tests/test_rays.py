@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
+from through import deviation
 
 from data_synthetic import GaussianBall, GradedIndexRod, LayeredMedium
 from torchdic import Fidelity, Grid, Rays, Volume, launch, trace
 from torchdic.rays import solver as ray_solver
-from torchdic.rays.trace import deviation
 
 N0 = 1.36
 DIRECTIONS = torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.0, -0.5], [0.4, 0.6], [-0.7, 0.1]], dtype=torch.float64)

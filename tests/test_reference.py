@@ -5,18 +5,7 @@ import pytest
 import torch
 
 from data_synthetic import Bead, GaussianBall
-from torchdic import (
-    Acquisition,
-    Condenser,
-    Fidelity,
-    Grid,
-    Microscope,
-    Objective,
-    Prism,
-    Volume,
-    image,
-    image_field,
-)
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
 
 
 def contrast_error(images, expected):

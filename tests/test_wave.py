@@ -11,7 +11,7 @@ from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
 from torchdic.errors import SlabWarning, UnstableError
 from torchdic.plane_waves import axial_difference, to_field, to_spectrum
-from torchdic.propagation.wave import slab_mean, split_step
+from torchdic.propagation.split_step import slab_mean, split_step
 
 N0 = 1.36
 WAVELENGTH = 0.546
