@@ -2,8 +2,13 @@
 
 import math
 import os
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from types import CodeType
+from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -11,10 +16,33 @@ import pytest
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
-from jaxtyping import install_import_hook
+
+jaxtyped = jaxtyping.jaxtyped
+made: Counter[CodeType] = Counter()
+
+
+def checked_at_first(*, typechecker: Any) -> Callable:
+    """jaxtyping's decorator, but a function that another one defines is checked the first 20 times it is defined only.
+
+    The import hook decorates each definition. To build the check takes milliseconds, and a solver defines functions at
+    every step.
+    """
+    check = jaxtyped(typechecker=typechecker)
+
+    def decorated(function: Any) -> Any:
+        code = getattr(function, "__code__", None)
+        if code is None or "<locals>" not in function.__qualname__:
+            return check(function)
+        made[code] += 1
+        return check(function) if made[code] <= 20 else function
+
+    return decorated
+
+
+jaxtyping.jaxtyped = checked_at_first
 
 # int is accepted where float is asked for, as the type checker does (PEP 484's numeric tower).
-install_import_hook(
+jaxtyping.install_import_hook(
     ["torchdic", "data_synthetic", "recon"],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
@@ -29,10 +57,11 @@ PROPAGATIONS = ("projection", "rays", "wave")
 def _deterministic():
     """The same numbers in every test, whichever tests ran before it."""
     torch.manual_seed(0)
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(True)
+    before = torch.get_deterministic_debug_mode()
+    # torch.use_deterministic_algorithms says the same, but imports torch's compiler
+    torch.set_deterministic_debug_mode("error")
     yield
-    torch.use_deterministic_algorithms(before)
+    torch.set_deterministic_debug_mode(before)
 
 
 @pytest.fixture(params=PROPAGATIONS)
