@@ -68,6 +68,7 @@ def test_a_missing_image_is_one_line_and_exit_2(measured, monkeypatch, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_measured_beads_are_round_and_alike(measured, measured_file, monkeypatch, tmp_path):
     measured_file("dic_agar_beads.tiff")
     assert run(measured, monkeypatch, "--out", tmp_path / "out") == 0

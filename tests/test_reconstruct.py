@@ -409,7 +409,7 @@ def interrupted(path, out, number, wanted=12):
     return process.returncode, err.decode("utf-8", "replace")
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize("name", [pytest.param("SIGINT", marks=pytest.mark.slow), "SIGTERM", "SIGKILL"])
 def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp_path, name):
     path, whole = long
     out = tmp_path / "out"
