@@ -180,7 +180,7 @@ def test_sources_share_their_transforms_and_evaluations(delta, counted, propagat
     assert 4 * peak(one) < peak(many) < 10 * peak(one)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2)), 3])
 def test_field_of_a_source_serves_every_prism_and_focus(delta, counted, propagation, count):
     """Propagation is paid once a batch; after it, one inverse transform per prism, focus and batch is all."""
     scope = directions(5)
@@ -252,7 +252,23 @@ ABSENT = {
 }
 
 
-@pytest.mark.parametrize("absent", ABSENT.values(), ids=ABSENT.keys())
+# how light crosses the specimen can have a part in these
+CROSSING = ("absorption", "polarisation", "jones-pupil", "spectrum", "padding", "object-aberration")
+
+
+@pytest.mark.parametrize(
+    ("propagation", "absent"),
+    [
+        pytest.param(
+            propagation,
+            absent,
+            id=f"{propagation}-{name}",
+            marks=() if propagation == "projection" or name in CROSSING else pytest.mark.slow,
+        )
+        for propagation in ("projection", "rays", "wave")
+        for name, absent in ABSENT.items()
+    ],
+)
 def test_what_is_absent_costs_nothing_and_changes_no_bit(delta, counted, propagation, absent):
     """The noise of a camera belongs to its recording, not to the image."""
     parts, options = absent
