@@ -111,7 +111,18 @@ def as_here(values, microscope, fidelity):
         torch.testing.assert_close(bring(value), here[name].detach(), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCOPES)
+# what rays bring to the microscope: a phase for each colour, and their polarisation
+OF_RAYS = ("plain", "colours", "lenses of matrices")
+
+
+@pytest.mark.parametrize(
+    ("propagation", "name"),
+    [
+        pytest.param(propagation, name, marks=pytest.mark.slow if propagation == "rays" and name not in OF_RAYS else ())
+        for propagation in ("projection", "rays", "wave")
+        for name in SCOPES
+    ],
+)
 def test_every_microscope_images_there_as_here(values, name, propagation):
     as_here(values, SCOPES[name], replace(FIDELITY, propagation=propagation))
 
