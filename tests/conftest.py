@@ -1,11 +1,15 @@
-"""Annotations are enforced here, and only here: each call checks the shapes and types it was promised."""
+"""Annotations are enforced here, and only here: each call checks the shapes and types it was promised.
 
+`make test` checks the first 100 calls of each function in each test, `make test-all` every one.
+"""
+
+import functools
 import math
 import os
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from types import CodeType
+from types import CodeType, FunctionType
 from typing import Any
 
 import jaxtyping
@@ -19,22 +23,34 @@ import torch
 
 jaxtyped = jaxtyping.jaxtyped
 made: Counter[CodeType] = Counter()
+called: Counter[CodeType] = Counter()
+most_calls = math.inf
 
 
 def checked_at_first(*, typechecker: Any) -> Callable:
-    """jaxtyping's decorator, but a function that another one defines is checked the first 20 times it is defined only.
+    """jaxtyping's decorator, but it does not check what repeats itself.
 
-    The import hook decorates each definition. To build the check takes milliseconds, and a solver defines functions at
-    every step.
+    A function that another one defines is checked the first 20 times that it is defined: the import hook decorates each
+    definition, to build the check takes milliseconds, and a solver defines functions at every step. Any other function
+    is checked at its first `most_calls` calls in each test.
     """
     check = jaxtyped(typechecker=typechecker)
 
     def decorated(function: Any) -> Any:
-        code = getattr(function, "__code__", None)
-        if code is None or "<locals>" not in function.__qualname__:
+        if not isinstance(function, FunctionType):
             return check(function)
-        made[code] += 1
-        return check(function) if made[code] <= 20 else function
+        code = function.__code__
+        if "<locals>" in function.__qualname__:
+            made[code] += 1
+            return check(function) if made[code] <= 20 else function
+        checked = check(function)
+
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            called[code] += 1
+            return (checked if called[code] <= most_calls else function)(*arguments, **named)
+
+        return call
 
     return decorated
 
@@ -56,6 +72,7 @@ PROPAGATIONS = ("projection", "rays", "wave")
 @pytest.fixture(autouse=True)
 def _deterministic():
     """The same numbers in every test, whichever tests ran before it."""
+    called.clear()
     torch.manual_seed(0)
     before = torch.get_deterministic_debug_mode()
     # torch.use_deterministic_algorithms says the same, but imports torch's compiler
@@ -134,6 +151,11 @@ def measured_file():
         return path
 
     return find
+
+
+def pytest_configure(config):
+    global most_calls
+    most_calls = 100 if config.option.markexpr == "not slow" else math.inf
 
 
 def pytest_addoption(parser):

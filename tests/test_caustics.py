@@ -133,8 +133,12 @@ def lens(slices, behind=0, contrast=0.11, n=28):
 )
 @pytest.mark.parametrize(
     "options",
-    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-7}],
-    ids=["linear", "cubic", "recomputed", "adaptive"],
+    [
+        pytest.param({}, id="linear", marks=pytest.mark.slow),
+        pytest.param({"interpolation": "cubic"}, id="cubic"),
+        pytest.param({"memory": 1}, id="recomputed"),
+        pytest.param({"solver": "dopri5", "tolerance": 1e-7}, id="adaptive"),
+    ],
 )
 def test_empty_slices_behind_do_not_show(momentum, options):
     """Whether a focus lies before or behind the last face, the field at a plane in the ball is the same."""

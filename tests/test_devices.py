@@ -31,7 +31,7 @@ GRID = Grid((6, 11, 14), (0.4, 0.2, 0.21))
 # so small an array holds no light for long
 pytestmark = pytest.mark.filterwarnings("ignore::torchdic.wrap_around.WrapAroundWarning")
 SCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))
-FIDELITY = Fidelity(sources=5)
+FIDELITY = Fidelity(sources=3)
 
 
 def learned(value):
