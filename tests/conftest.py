@@ -137,6 +137,12 @@ def smooth_field():
     return make
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Figures are left as empty files: most of a short run's time is Matplotlib's."""
+    monkeypatch.setattr("recon.report.figures.save", lambda _figure, path: path.touch())
+
+
 @pytest.fixture(scope="session")
 def measured_file():
     """A function from a name to the measured file; the test skips where it is absent."""

@@ -670,6 +670,7 @@ def test_bad_input_is_one_line_and_exit_code_2(write, tmp_path, capsys, command,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_path, capsys):
     path = write()
@@ -691,6 +692,7 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch):
     path = write()

@@ -94,6 +94,11 @@ def workplace(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def _pictures_in_the_workplace_only(workplace, no_pictures):
+    pass
+
+
 @pytest.fixture
 def other(workplace, tmp_path):
     """A function from changes of the configuration to a file of its own, on the same stack unless it says otherwise."""
