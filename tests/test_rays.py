@@ -335,7 +335,7 @@ def test_adaptive_solver_meets_its_tolerance_on_a_few_hard_rays_among_many(monke
     assert error() > 5 * ours
 
 
-@pytest.mark.parametrize("solver", ["bosh3", "dopri5", pytest.param("dopri8", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solver", ["dopri5", *(pytest.param(s, marks=pytest.mark.slow) for s in ("bosh3", "dopri8"))])
 def test_adaptive_solver_does_not_jump_over_a_specimen_behind_an_empty_stretch(solver):
     layer = LayeredMedium(0.1, N0, 12.0, 1.0, 0.2)
     grid = Grid((140, 2, 2), (0.25, 0.3, 0.3))
@@ -347,7 +347,7 @@ def test_adaptive_solver_does_not_jump_over_a_specimen_behind_an_empty_stretch(s
     torch.testing.assert_close(found.opd, exact.opd, rtol=0.01, atol=0)
 
 
-@pytest.mark.parametrize("solver", ["bosh3", "dopri5", "dopri8"])
+@pytest.mark.parametrize("solver", [pytest.param("bosh3", marks=pytest.mark.slow), "dopri5", "dopri8"])
 def test_adaptive_solvers_agree_with_the_exact_rod(solver):
     specimen, _, volume = rod()
     start = bundle(20)
