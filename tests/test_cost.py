@@ -317,8 +317,15 @@ def test_what_is_present_costs_its_own(delta, counted, parts, extra):
         assert peak(plain) < peak(declared) <= peak(plain) + 3 * FIELDS
 
 
-@pytest.mark.parametrize("method", ["linear", "cone"])
-@pytest.mark.parametrize("options", [{"propagation": "projection"}, {"propagation": "rays", "amplitude": False}])
+@pytest.mark.parametrize(
+    ("options", "method"),
+    [
+        ({"propagation": "projection"}, "cone"),
+        ({"propagation": "rays", "amplitude": False}, "linear"),
+        pytest.param({"propagation": "projection"}, "linear", marks=pytest.mark.slow),
+        pytest.param({"propagation": "rays", "amplitude": False}, "cone", marks=pytest.mark.slow),
+    ],
+)
 def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level(delta, counted, options, method):
     """Whatever the number of sources, prisms and focus planes; Δn is sampled from the object's plane to the last face.
 

@@ -42,7 +42,7 @@ def errors(table, exact, case, na, propagation, steps):
 @pytest.mark.parametrize(
     ("case", "na", "steps", "bound"),
     [
-        ("smooth ball", 0.2, 36, 0.0003),
+        pytest.param("smooth ball", 0.2, 36, 0.0003, marks=pytest.mark.slow),
         pytest.param("smooth ball", 0.5, 36, 0.0008, marks=pytest.mark.slow),
         ("smooth ball", 0.8, 36, 0.003),
         ("strong smooth ball", 0.8, 72, 0.011),

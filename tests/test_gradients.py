@@ -33,6 +33,9 @@ FIDELITIES = {
     "wave-recomputed": Fidelity("wave", steps=5, memory=1),
 }
 PARAMETERS = ("delta", "absorption", "background", "shear", "bias", "focus", "aberrations")
+# the others act on the field, whatever brought it
+CROSSING = ("delta", "absorption", "background")
+PROPAGATIONS = ("projection", "rays", "wave")
 
 
 def scalar(value):
@@ -91,7 +94,7 @@ def step(name, fidelity):
             name,
             fidelity,
             id=f"{name}-{way}",
-            marks=pytest.mark.slow if way == "rays-cubic-recomputed" and name not in ("delta", "background") else (),
+            marks=() if way in PROPAGATIONS or name in CROSSING else pytest.mark.slow,
         )
         for name in PARAMETERS
         for way, fidelity in FIDELITIES.items()

@@ -307,7 +307,7 @@ def test_one_slice_of_one_2d_image_is_reconstructed(other, workplace, tmp_path):
 
 
 def test_a_cameras_counts_are_flattened_and_scaled_to_the_models_unit(other, tmp_path):
-    wide = {"volume": {"shape": [5, 36, 32]}, "reconstruction": {"steps": 30}}
+    wide = {"volume": {"shape": [5, 36, 32]}, "reconstruction": {"steps": 15}}
     simulated = {"data": {"path": str(tmp_path / "simulated" / "stack.ome.tif")}}
     assert command("simulate", other(wide), "--out", tmp_path / "simulated")[0] == 0
     assert command("reconstruct", other(wide | simulated), "--out", tmp_path / "clean")[0] == 0
@@ -414,7 +414,7 @@ def interrupted(path, out, number, wanted=12):
     return process.returncode, err.decode("utf-8", "replace")
 
 
-@pytest.mark.parametrize("name", [pytest.param("SIGINT", marks=pytest.mark.slow), "SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize("name", [*(pytest.param(n, marks=pytest.mark.slow) for n in ("SIGINT", "SIGTERM")), "SIGKILL"])
 def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp_path, name):
     path, whole = long
     out = tmp_path / "out"
