@@ -1,9 +1,18 @@
-"""Annotations are enforced here, and only here: each call checks the shapes and types it was promised."""
+"""Annotations are enforced here, and only here: each call checks the shapes and types it was promised.
 
+`make test` checks the first 100 calls of each function in each test, `make test-all` every one.
+"""
+
+import functools
 import math
 import os
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from types import CodeType, FunctionType
+from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -11,10 +20,45 @@ import pytest
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
-from jaxtyping import install_import_hook
+
+jaxtyped = jaxtyping.jaxtyped
+made: Counter[CodeType] = Counter()
+called: Counter[CodeType] = Counter()
+most_calls = math.inf
+
+
+def checked_at_first(*, typechecker: Any) -> Callable:
+    """jaxtyping's decorator, but it does not check what repeats itself.
+
+    A function that another one defines is checked the first 20 times that it is defined: the import hook decorates each
+    definition, to build the check takes milliseconds, and a solver defines functions at every step. Any other function
+    is checked at its first `most_calls` calls in each test.
+    """
+    check = jaxtyped(typechecker=typechecker)
+
+    def decorated(function: Any) -> Any:
+        if not isinstance(function, FunctionType):
+            return check(function)
+        code = function.__code__
+        if "<locals>" in function.__qualname__:
+            made[code] += 1
+            return check(function) if made[code] <= 20 else function
+        checked = check(function)
+
+        @functools.wraps(function)
+        def call(*arguments: Any, **named: Any) -> Any:
+            called[code] += 1
+            return (checked if called[code] <= most_calls else function)(*arguments, **named)
+
+        return call
+
+    return decorated
+
+
+jaxtyping.jaxtyped = checked_at_first
 
 # int is accepted where float is asked for, as the type checker does (PEP 484's numeric tower).
-install_import_hook(
+jaxtyping.install_import_hook(
     ["torchdic", "data_synthetic", "recon"],
     "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
 )
@@ -28,11 +72,13 @@ PROPAGATIONS = ("projection", "rays", "wave")
 @pytest.fixture(autouse=True)
 def _deterministic():
     """The same numbers in every test, whichever tests ran before it."""
+    called.clear()
     torch.manual_seed(0)
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(True)
+    before = torch.get_deterministic_debug_mode()
+    # torch.use_deterministic_algorithms says the same, but imports torch's compiler
+    torch.set_deterministic_debug_mode("error")
     yield
-    torch.use_deterministic_algorithms(before)
+    torch.set_deterministic_debug_mode(before)
 
 
 @pytest.fixture(params=PROPAGATIONS)
@@ -91,6 +137,12 @@ def smooth_field():
     return make
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Figures are left as empty files: most of a short run's time is Matplotlib's."""
+    monkeypatch.setattr("recon.report.figures.save", lambda _figure, path: path.touch())
+
+
 @pytest.fixture(scope="session")
 def measured_file():
     """A function from a name to the measured file; the test skips where it is absent."""
@@ -105,6 +157,11 @@ def measured_file():
         return path
 
     return find
+
+
+def pytest_configure(config):
+    global most_calls
+    most_calls = 100 if config.option.markexpr == "not slow" else math.inf
 
 
 def pytest_addoption(parser):

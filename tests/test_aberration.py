@@ -127,7 +127,7 @@ def rod(alpha, length, half_width, spacing):
     return specimen, Volume(grid, specimen.delta(grid), N0)
 
 
-@pytest.mark.parametrize("turn", [0.3, 1.2, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize("turn", [0.3, 4.0, *(pytest.param(t, marks=pytest.mark.slow) for t in (1.2, 2.0, 3.0))])
 def test_rod_on_its_axis_images_by_its_abcd_matrix(turn):
     """An axial point L before the end face seems at L − tan(αL)/α; past a quarter pitch its image is real."""
     alpha, length = 0.25, turn / 0.25
@@ -171,7 +171,10 @@ def test_index_graded_along_one_axis_bends_the_wave_along_that_one():
         torch.testing.assert_close(radius, exact, rtol=0, atol=4e-5)
 
 
-@pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("midpoint", 2), ("rk4", 4)])
+@pytest.mark.parametrize(
+    ("solver", "order"),
+    [pytest.param("euler", 1, marks=pytest.mark.slow), pytest.param("midpoint", 2, marks=pytest.mark.slow), ("rk4", 4)],
+)
 def test_solver_has_its_order(solver, order):
     """Along a skew ray inside one voxel, off the axis, where errors odd in the step cancel; against many steps."""
     _, volume = rod(0.25, 4.0, 1.8, 0.9)
@@ -190,8 +193,14 @@ def test_solver_has_its_order(solver, order):
 # --- one method against the other ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lens", [math.inf, 25.0])
-@pytest.mark.parametrize("momentum", DIRECTIONS, ids=lambda p: str(p.tolist()))
+@pytest.mark.parametrize(
+    ("momentum", "lens"),
+    [
+        pytest.param(p, lens, id=f"{p.tolist()}-{lens}", marks=() if i == fast else pytest.mark.slow)
+        for lens, fast in ((math.inf, 4), (25.0, 3))
+        for i, p in enumerate(DIRECTIONS)
+    ],
+)
 def test_narrow_cone_agrees_with_the_linear_pair(momentum, lens):
     """To 1e-4 µm of a shift of 0.07 to 0.2 µm, wherever the lens is."""
     volume, points = ball((60, 120, 120)), places(20)

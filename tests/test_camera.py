@@ -276,6 +276,7 @@ def config(tmp_path):
     return put
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_simulated_counts_are_integers_that_a_reconstruction_scales_back(config, tmp_path):
     path = config()
     assert main(["simulate", str(path), "--out", str(tmp_path / "simulated"), "--device", "cpu"]) == 0
@@ -306,6 +307,7 @@ def test_simulated_counts_are_integers_that_a_reconstruction_scales_back(config,
     ],
     ids=["leaking polarisers", "strained lenses", "stopped light", "no condenser prism"],
 )
+@pytest.mark.usefixtures("no_pictures")
 def test_counts_are_scaled_to_the_empty_field_of_the_microscope_that_is_declared(tmp_path, microscope):
     """Not to sin²(bias/2), which is that of an ideal one."""
     camera = CONFIG["microscope"]["camera"]

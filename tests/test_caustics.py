@@ -56,11 +56,26 @@ RODS = {
 }
 
 
-@pytest.mark.parametrize(("ratio", "length", "caustics"), RODS.values(), ids=RODS.keys())
+WAYS = {
+    "few-steps": Fidelity("rays", steps=11),
+    "cubic": CUBIC,
+    "linear": Fidelity("rays"),
+    "adaptive": Fidelity("rays", solver="dopri5", tolerance=1e-4),
+}
+
+
 @pytest.mark.parametrize(
-    "fidelity",
-    [CUBIC, Fidelity("rays"), Fidelity("rays", steps=11), Fidelity("rays", solver="dopri5", tolerance=1e-4)],
-    ids=["cubic", "linear", "few-steps", "adaptive"],
+    ("ratio", "length", "caustics", "fidelity"),
+    [
+        pytest.param(
+            *rod,
+            fidelity,
+            id=f"{way}-{name}",
+            marks=() if way == "few-steps" or name == "two-round-foci" else pytest.mark.slow,
+        )
+        for way, fidelity in WAYS.items()
+        for name, rod in RODS.items()
+    ],
 )
 def test_each_focus_of_a_graded_index_rod_is_counted(ratio, length, caustics, fidelity):
     """On the axis by the Gouy phase: −π/2 for each, in the field behind it, with the amplitude of the tube's area."""
@@ -80,7 +95,7 @@ def test_each_focus_of_a_graded_index_rod_is_counted(ratio, length, caustics, fi
     assert abs(complex(field)) == pytest.approx(abs(area) ** -0.5, rel=0.05)
 
 
-@pytest.mark.parametrize("length", [0.25, 0.75, 1.25, 1.75, 2.25])
+@pytest.mark.parametrize("length", [0.25, 2.25, *(pytest.param(n, marks=pytest.mark.slow) for n in (0.75, 1.25, 1.75))])
 def test_beam_in_a_graded_index_slab_has_the_waves_phase(length):
     """A Gaussian beam, cut out by an absorbing first slice: on the axis (cos αz + iβ sin αz)^(−½), β = (mode/waist)².
 
@@ -112,11 +127,18 @@ def lens(slices, behind=0, contrast=0.11, n=28):
     return Volume(grid, ball, 1.36), centre
 
 
-@pytest.mark.parametrize("momentum", [(0.0, 0.0), (0.35, -0.2)], ids=["axial", "oblique"])
+@pytest.mark.parametrize(
+    "momentum",
+    [pytest.param((0.0, 0.0), id="axial", marks=pytest.mark.slow), pytest.param((0.35, -0.2), id="oblique")],
+)
 @pytest.mark.parametrize(
     "options",
-    [{}, {"interpolation": "cubic"}, {"memory": 1}, {"solver": "dopri5", "tolerance": 1e-7}],
-    ids=["linear", "cubic", "recomputed", "adaptive"],
+    [
+        pytest.param({}, id="linear", marks=pytest.mark.slow),
+        pytest.param({"interpolation": "cubic"}, id="cubic"),
+        pytest.param({"memory": 1}, id="recomputed"),
+        pytest.param({"solver": "dopri5", "tolerance": 1e-7}, id="adaptive"),
+    ],
 )
 def test_empty_slices_behind_do_not_show(momentum, options):
     """Whether a focus lies before or behind the last face, the field at a plane in the ball is the same."""
@@ -176,8 +198,15 @@ def test_smooth_ball_is_not_searched_and_a_strong_lens_is(looks, interpolation):
     assert len(looks) == 26
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-@pytest.mark.parametrize("momentum", [(0.0, 0.0), (0.35, -0.2)], ids=["axial", "oblique"])
+@pytest.mark.parametrize(
+    ("momentum", "interpolation"),
+    [
+        pytest.param((0.0, 0.0), "linear", id="axial-linear"),
+        pytest.param((0.35, -0.2), "cubic", id="oblique-cubic"),
+        pytest.param((0.0, 0.0), "cubic", id="axial-cubic", marks=pytest.mark.slow),
+        pytest.param((0.35, -0.2), "linear", id="oblique-linear", marks=pytest.mark.slow),
+    ],
+)
 def test_no_fold_escapes_the_bound_and_it_is_not_much_too_wary(interpolation, momentum):
     """As a ball becomes stronger, its tubes are followed from some contrast on, and some fold from a higher one on."""
     source, fidelity = torch.tensor([momentum], dtype=torch.float64), Fidelity("rays", interpolation=interpolation)

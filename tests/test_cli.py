@@ -333,6 +333,7 @@ def test_demo_checks_its_folder_before_it_begins(refused, tmp_path):
     ],
     ids=lambda specimen: specimen["kind"],
 )
+@pytest.mark.usefixtures("no_pictures")
 def test_each_specimen_is_simulated_from_its_file(write, run, tmp_path, specimen):
     assert run("simulate", write({"specimen": specimen})) == (0, [])
     written = read_stack(tmp_path / "out" / "stack.ome.tif")
@@ -406,6 +407,7 @@ def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkey
     "room", [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
 )
 @pytest.mark.parametrize("start", ["linear", "zero"])
+@pytest.mark.usefixtures("no_pictures")
 def test_a_reconstruction_without_room_is_refused_before_it_begins(
     write, run, refused, monkeypatch, tmp_path, start, room
 ):

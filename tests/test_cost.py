@@ -181,7 +181,7 @@ def test_sources_share_their_transforms_and_evaluations(delta, counted, propagat
     assert 4 * peak(one) < peak(many) < 10 * peak(one)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2)), 3])
 def test_field_of_a_source_serves_every_prism_and_focus(delta, counted, propagation, count):
     """Propagation is paid once a batch; after it, one inverse transform per prism, focus and batch is all."""
     scope = directions(5)
@@ -253,7 +253,23 @@ ABSENT = {
 }
 
 
-@pytest.mark.parametrize("absent", ABSENT.values(), ids=ABSENT.keys())
+# how light crosses the specimen can have a part in these
+CROSSING = ("absorption", "polarisation", "jones-pupil", "spectrum", "padding", "object-aberration")
+
+
+@pytest.mark.parametrize(
+    ("propagation", "absent"),
+    [
+        pytest.param(
+            propagation,
+            absent,
+            id=f"{propagation}-{name}",
+            marks=() if propagation == "projection" or name in CROSSING else pytest.mark.slow,
+        )
+        for propagation in ("projection", "rays", "wave")
+        for name, absent in ABSENT.items()
+    ],
+)
 def test_what_is_absent_costs_nothing_and_changes_no_bit(delta, counted, propagation, absent):
     """The noise of a camera belongs to its recording, not to the image."""
     parts, options = absent
@@ -302,8 +318,15 @@ def test_what_is_present_costs_its_own(delta, counted, parts, extra):
         assert peak(plain) < peak(declared) <= peak(plain) + 3 * FIELDS
 
 
-@pytest.mark.parametrize("method", ["linear", "cone"])
-@pytest.mark.parametrize("options", [{"propagation": "projection"}, {"propagation": "rays", "amplitude": False}])
+@pytest.mark.parametrize(
+    ("options", "method"),
+    [
+        ({"propagation": "projection"}, "cone"),
+        ({"propagation": "rays", "amplitude": False}, "linear"),
+        pytest.param({"propagation": "projection"}, "linear", marks=pytest.mark.slow),
+        pytest.param({"propagation": "rays", "amplitude": False}, "cone", marks=pytest.mark.slow),
+    ],
+)
 def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level(delta, counted, options, method):
     """Whatever the number of sources, prisms and focus planes; Δn is sampled from the object's plane to the last face.
 

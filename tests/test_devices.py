@@ -32,7 +32,7 @@ GRID = Grid((6, 11, 14), (0.4, 0.2, 0.21))
 # so small an array holds no light for long
 pytestmark = pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 SCOPE = Microscope(0.546, Objective(0.75), Condenser(0.4))
-FIDELITY = Fidelity(sources=5)
+FIDELITY = Fidelity(sources=3)
 
 
 def learned(value):
@@ -112,7 +112,18 @@ def as_here(values, microscope, fidelity):
         torch.testing.assert_close(bring(value), here[name].detach(), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCOPES)
+# what rays bring to the microscope: a phase for each colour, and their polarisation
+OF_RAYS = ("plain", "colours", "lenses of matrices")
+
+
+@pytest.mark.parametrize(
+    ("propagation", "name"),
+    [
+        pytest.param(propagation, name, marks=pytest.mark.slow if propagation == "rays" and name not in OF_RAYS else ())
+        for propagation in ("projection", "rays", "wave")
+        for name in SCOPES
+    ],
+)
 def test_every_microscope_images_there_as_here(values, name, propagation):
     as_here(values, SCOPES[name], replace(FIDELITY, propagation=propagation))
 

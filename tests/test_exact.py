@@ -290,7 +290,7 @@ def test_steep_smooth_edge_converges_to_the_sphere():
     assert np.log2(np.array(errors[:-1]) / errors[1:]).min() > 1.8
 
 
-@pytest.mark.parametrize("contrast", [0.03, 0.1])
+@pytest.mark.parametrize("contrast", [pytest.param(0.03, marks=pytest.mark.slow), 0.1])
 def test_partial_waves_of_a_smooth_ball_agree_with_an_initial_value_solver(contrast):
     # u = r·R_l as it stands, by DOP853 from deep inside its turning point, matched in value and slope.
     radius, n0, k0 = 16.5, 1.36, 2 * np.pi / WAVELENGTH
@@ -334,7 +334,9 @@ STRONG = {
 }
 
 
-@pytest.mark.parametrize("name", STRONG)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "smooth ball" else ()) for name in STRONG]
+)
 def test_strong_balls_are_finite_lose_no_light_and_obey_the_optical_theorem(name):
     index, radius, n0 = STRONG[name]
     a = radial_coefficients(WAVELENGTH, index, radius, n0)

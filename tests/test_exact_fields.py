@@ -42,12 +42,12 @@ def errors(table, exact, case, na, propagation, steps):
 @pytest.mark.parametrize(
     ("case", "na", "steps", "bound"),
     [
-        ("smooth ball", 0.2, 36, 0.0003),
-        ("smooth ball", 0.5, 36, 0.0008),
+        pytest.param("smooth ball", 0.2, 36, 0.0003, marks=pytest.mark.slow),
+        pytest.param("smooth ball", 0.5, 36, 0.0008, marks=pytest.mark.slow),
         ("smooth ball", 0.8, 36, 0.003),
         ("strong smooth ball", 0.8, 72, 0.011),
         ("sharp bead", 0.8, 40, 0.03),
-        ("strong bead", 0.2, 80, 0.035),
+        pytest.param("strong bead", 0.2, 80, 0.035, marks=pytest.mark.slow),
         ("strong bead", 0.8, 160, 0.044),
         pytest.param("strong bead", 0.8, 640, 0.03, marks=pytest.mark.slow),
     ],

@@ -13,7 +13,7 @@ from torchdic import Acquisition, Grid, Microscope, Objective, Prism, Volume, im
 from torchdic.files.stack import read_volume, write_stack
 
 SCRIPT = Path(__file__).parents[1] / "experiments" / "measured.py"
-SHAPE = (200, 256)
+SHAPE = (128, 160)
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def discs() -> torch.Tensor:
     random = torch.Generator().manual_seed(3)
     y, x = torch.meshgrid(torch.arange(1.0 * SHAPE[0]), torch.arange(1.0 * SHAPE[1]), indexing="ij")
     delta = torch.zeros(SHAPE)
-    for _ in range(40):
+    for _ in range(16):
         place = torch.rand(3, generator=random)
         cy, cx = (30 + (n - 60) * float(p) for n, p in zip(SHAPE, place, strict=False))
         delta = torch.maximum(delta, torch.exp(-((y - cy) ** 2 + (x - cx) ** 2) / (2 * (3 + 4 * place[2]) ** 2)))
@@ -42,6 +42,7 @@ def run(measured, monkeypatch, *arguments) -> int:
     return measured.main()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_sheared_image_gives_back_its_phase_but_for_scale_and_sign(measured, monkeypatch, tmp_path, discs, capsys):
     grid = Grid((1, *SHAPE), (1.0, 0.25, 0.25))
     angle = math.radians(30)
@@ -68,6 +69,7 @@ def test_a_missing_image_is_one_line_and_exit_2(measured, monkeypatch, tmp_path,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_measured_beads_are_round_and_alike(measured, measured_file, monkeypatch, tmp_path):
     measured_file("dic_agar_beads.tiff")
     assert run(measured, monkeypatch, "--out", tmp_path / "out") == 0

@@ -37,8 +37,18 @@ def drawn(figure, path):
 # images
 
 
-@pytest.mark.parametrize("prisms", [PRISMS, PRISMS[:1], PRISMS[1:2]], ids=["three", "one", "bright field"])
-@pytest.mark.parametrize(("focus", "planes"), [((0.5,), [0]), ((0.0, 1.0), [0, 1]), (range(9), [2, 4, 6])])
+@pytest.mark.parametrize(
+    ("focus", "planes", "prisms"),
+    [
+        pytest.param(focus, planes, prisms, id=f"{planes}-{name}", marks=() if name == fast else pytest.mark.slow)
+        for focus, planes, fast in (
+            ((0.5,), [0], "bright field"),
+            ((0.0, 1.0), [0, 1], "one"),
+            (range(9), [2, 4, 6], "three"),
+        )
+        for name, prisms in (("three", PRISMS), ("one", PRISMS[:1]), ("bright field", PRISMS[1:2]))
+    ],
+)
 def test_each_prism_shows_measured_modelled_and_residual(tmp_path, prisms, focus, planes):
     measured, modelled = torch.rand(2, len(prisms), len(focus), 9, 12)
     figure = figures.draw_images(measured, modelled, prisms, focus, GRID)

@@ -22,6 +22,9 @@ FIDELITIES = {
     "wave-recomputed": Fidelity("wave", steps=5, memory=1),
 }
 PARAMETERS = ("delta", "absorption", "background", "shear", "bias", "focus", "aberrations")
+# the others act on the field, whatever brought it
+CROSSING = ("delta", "absorption", "background")
+PROPAGATIONS = ("projection", "rays", "wave")
 
 
 def scalar(value):
@@ -73,8 +76,19 @@ def step(name, fidelity):
     return {"delta": 1e-7 if fidelity.propagation == "rays" else 1e-5, "background": 1e-5}.get(name, 1e-4)
 
 
-@pytest.mark.parametrize("fidelity", FIDELITIES.values(), ids=FIDELITIES.keys())
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize(
+    ("name", "fidelity"),
+    [
+        pytest.param(
+            name,
+            fidelity,
+            id=f"{name}-{way}",
+            marks=() if way in PROPAGATIONS or name in CROSSING else pytest.mark.slow,
+        )
+        for name in PARAMETERS
+        for way, fidelity in FIDELITIES.items()
+    ],
+)
 def test_gradient_is_the_central_difference(point, fidelity, name):
     value = point[name].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(compute({**point, name: value}, fidelity), value)

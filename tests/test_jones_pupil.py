@@ -493,8 +493,8 @@ def test_turning_a_beam_pair_by_180_degrees_changes_nothing():
         close(found, seen(Polarisation(pupil=EVERYTHING), [replace(PRISM, axis=0.3)]))
 
 
-@pytest.mark.parametrize("error", [0.0, 0.7, -0.7])
-@pytest.mark.parametrize(("contrast", "tolerance"), [(0.002, 0.01), (0.01, 0.03)])
+@pytest.mark.parametrize("error", [pytest.param(0.0, marks=pytest.mark.slow), 0.7, -0.7])
+@pytest.mark.parametrize(("contrast", "tolerance"), [(0.002, 0.01), pytest.param(0.01, 0.03, marks=pytest.mark.slow)])
 def test_rays_carry_the_polarisation_that_the_wave_scatters(contrast, tolerance, error):
     """A smooth ball in oblique light between crossed polarisers, no shear: all that is seen is the turn.
 

@@ -195,7 +195,7 @@ def test_amplitude_is_what_conserves_it():
     assert float(with_.min()) < 0.99
 
 
-@pytest.mark.parametrize("plane", [-1.0, 0.3, 1.5])
+@pytest.mark.parametrize("plane", [-1.0, *(pytest.param(z, marks=pytest.mark.slow) for z in (0.3, 1.5))])
 def test_reference_plane_does_not_show_for_a_smooth_ball(plane):
     """Where the field is formed is a matter of computation: within 1 % of the contrast at planes inside the ball."""
     grid = Grid((28, 48, 48), (0.45, 0.3, 0.3))

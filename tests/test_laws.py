@@ -128,7 +128,7 @@ def test_positive_shear_and_bias_brighten_rising_opd(propagation, axis):
         assert float(images[0, 0, *after]) < empty - 0.01
 
 
-@pytest.mark.parametrize("bias", [0.5, math.pi / 2, -1.2])
+@pytest.mark.parametrize("bias", [*(pytest.param(b, marks=pytest.mark.slow) for b in (0.5, math.pi / 2)), -1.2])
 def test_weak_phase_image_is_sin2_of_half_bias_and_half_shear_times_gradient(propagation, bias):
     """I ≈ sin²(bias/2 + ½ s·∇φ), φ = k0 ∫Δn dz: for a gentle specimen to 2 % of the contrast."""
     grid = Grid((11, 64, 60), (0.6, 0.2, 0.22))
@@ -425,7 +425,11 @@ def test_reversing_the_optical_axis_of_a_symmetric_setup_leaves_a_weak_image_mir
 # --- voxels --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("fine", "tolerance"), [((3, 1, 1), 0.01), ((1, 3, 3), 0.02), ((3, 3, 3), 0.02)], ids=str)
+@pytest.mark.parametrize(
+    ("fine", "tolerance"),
+    [((3, 1, 1), 0.01), ((1, 3, 3), 0.02), pytest.param((3, 3, 3), 0.02, marks=pytest.mark.slow)],
+    ids=str,
+)
 def test_index_does_not_depend_on_voxel_size(propagation, fine, tolerance):
     """A third of the voxel size along z, along y and x, or all: the same image at the shared centres.
 

@@ -480,7 +480,10 @@ def test_specimens_one_voxel_wide_reach_the_sides_and_stay_cylinders():
     assert found.error <= 0.05
 
 
-@pytest.mark.parametrize("condenser", [Condenser(0.765), Condenser(0.78, inner_na=0.7), Condenser(1.1)])
+@pytest.mark.parametrize(
+    "condenser",
+    [Condenser(0.78, inner_na=0.7), *(pytest.param(Condenser(na), marks=pytest.mark.slow) for na in (0.765, 1.1))],
+)
 def test_a_condenser_that_the_pupils_edge_divides_is_planned_for(condenser):
     grid = Grid((8, 48, 52), (0.4, 0.14, 0.14))
     ball = volume(GaussianBall(0.8, 0.02, 1.36).delta(grid), grid)
@@ -490,7 +493,7 @@ def test_a_condenser_that_the_pupils_edge_divides_is_planned_for(condenser):
     assert found.error <= 0.2
 
 
-@pytest.mark.parametrize("tolerance", [0.05, 0.02])
+@pytest.mark.parametrize("tolerance", [pytest.param(0.05, marks=pytest.mark.slow), 0.02])
 def test_an_edge_across_the_sides_of_a_wide_array_is_seen(tolerance):
     """A periodic array's last column is beside its first."""
     grid = Grid((5, 40, 120), (0.3, 0.2, 0.2))
@@ -519,7 +522,7 @@ def test_coherent_light_keeps_its_rings_far_beyond_the_sides():
     assert 0.06 < made.error < 0.12  # 0.074 against 150 voxels of padding
 
 
-@pytest.mark.parametrize("wavelength", [0.55, 0.6])
+@pytest.mark.parametrize("wavelength", [pytest.param(0.55, marks=pytest.mark.slow), 0.6])
 def test_slabs_carry_the_shortest_of_many_colours(wavelength):
     grid = Grid((4, 24, 24), (0.8, 0.12, 0.12))
     bead = volume(Bead(1.0, 0.25, 1.36).delta(grid), grid)
@@ -543,7 +546,7 @@ def test_a_spectrum_is_left_out_for_light_of_the_nominal_wavelength():
 # its manners
 
 
-@pytest.mark.parametrize("tolerance", [0.011, 0.012, 0.013])
+@pytest.mark.parametrize("tolerance", [0.011, *(pytest.param(t, marks=pytest.mark.slow) for t in (0.012, 0.013))])
 def test_what_the_warning_says_to_ask_for_is_enough(tolerance):
     grid = Grid((8, 40, 44), (0.4, 0.2, 0.2))
     ball = volume(GaussianBall(0.8, 0.02, 1.36).delta(grid), grid)
@@ -671,6 +674,7 @@ def test_bad_input_is_one_line_and_exit_code_2(write, tmp_path, capsys, command,
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_path, capsys):
     path = write()
@@ -692,6 +696,7 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
+@pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch):
     path = write()
