@@ -69,7 +69,7 @@ class Device:
 
     def wait(self, what: str) -> None:
         """Count one, and whose it is."""
-        frames = (f for f in reversed(traceback.extract_stack()) if str(Path(f.filename).parent) in AUTHORS)
+        frames = (f for f in reversed(traceback.extract_stack()) if AUTHORS & set(map(str, Path(f.filename).parents)))
         frame = next(frames, None)
         place = f"{Path(frame.filename).stem}.{frame.name}" if frame else "the caller"
         self.waits[f"{what} in {place}"] += 1

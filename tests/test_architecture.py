@@ -1,55 +1,42 @@
-"""Imports point down, the inverse cannot see the truth, and the public names are those promised."""
+"""The house keeps its rules: rooms in the order of imports, small files and functions, names in their places."""
 
 import ast
 import inspect
+import subprocess
+import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 import torchdic
+from torchdic.propagation.base import propagations
 
 ROOT = Path(__file__).parent.parent
+PACKAGES = ("torchdic", "recon", "data_synthetic")
 
-# torchdic's files, lowest first: each imports only from files above it in this list.
-LAYERS = (
-    "files",
+# torchdic's rooms and single files, lowest first: each imports only from those before it in this list, and from itself.
+ROOMS = (
+    "errors",
     "scalar",
     "grid",
-    "sampling",
-    "volume",
-    "condenser",
-    "fidelity",
-    "recompute",
-    "ray_equation",
-    "ray_solver",
-    "caustics",
-    "rays",
-    "landing",
-    "projection",
-    "wave",
-    "aberration",
-    "objective",
-    "jones_pupil",
-    "jones",
-    "prism",
-    "space_variant",
-    "camera",
-    "instrument",
-    "wrap_around",
-    "passband",
-    "imaging",
     "memory",
-    "microscope",
-    "weak",
-    "image_error",
-    "pilots",
-    "cost",
-    "ladders",
-    "effects",
-    "plan",
-    "precision",
+    "plane_waves",
+    "specimen",
+    "fidelity",
+    "instrument",
+    "imaging",
+    "rays",
+    "propagation",
+    "object_aberration",
+    "forward",
+    "linear",
+    "planning",
+    "files",
     "tiff",
 )
+# recon's, likewise; data_synthetic stands beside them, and only the command line sees it.
+RECON = ("recording", "fit", "descend", "config", "report", "run", "cli")
 CONTRACT = {
     "Acquisition",
     "Camera",
@@ -67,20 +54,46 @@ CONTRACT = {
     "plan",
     "trace",
 }
+MOST_FILES, MOST_PARAMETERS, MOST_LINES = 10, 7, 50
+# Functions that are larger, each with the reason why it is better so.
+LARGER = {
+    "Prism.from_wedge": "its parameters are the keys of a configuration's wedge",
+    "transfer_function": "a public function since 0.1, whose parameters are those of an image",
+    "transfer_functions": "as transfer_function, for all images at once",
+    "effective_defocus": "as wavefront, whose result it reads",
+    "wavefront": "what the paper's section 3.3 chooses: the point, the cone and the lens",
+    "descend": "a public function since 0.1: what the data were recorded with, and how to descend",
+    "sphere_field": "a public function since 0.1: the sphere, the light and the array",
+    "radial_field": "as sphere_field, and the profile of the index",
+    "RayEquation.pull_back": "the derivative of one equation, in the order of its terms",
+}
+# Where a propagation's name may stand: its own room, the fidelity that names it, and the planner's comparisons.
+NAMED_IN = ("torchdic/propagation/", "torchdic/fidelity.py", "torchdic/planning/comparisons.py")
 
 
 def modules(package):
     return sorted((ROOT / package).rglob("*.py"))
 
 
+def name_of(path):
+    return str(path.relative_to(ROOT))
+
+
+ALL = [path for package in PACKAGES for path in modules(package)]
+
+
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imported(path):
     """The full names of the modules that a file imports, wherever in it."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative imports hide the layer"
+            assert node.level == 0, f"{path}: relative imports hide the room"
             assert node.module is not None
             # "from package import module" names a module too
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
@@ -91,64 +104,177 @@ def packages(path):
     return {name.split(".")[0] for name in imported(path)}
 
 
-def test_every_file_of_torchdic_has_its_layer():
-    found = {path.stem for path in modules("torchdic")} - {"__init__"}
-    assert found <= set(LAYERS)
-    assert len(found) >= 14
+def room(path):
+    """The room or single file of a package in which a file is."""
+    return Path(*path.relative_to(ROOT).parts[1:2]).stem
 
 
-@pytest.mark.parametrize("path", modules("torchdic"), ids=lambda p: p.stem)
+def rooms_imported(path, package):
+    known = {room(p) for p in modules(package)}
+    return {name.split(".")[1] for name in imported(path) if name.startswith(f"{package}.")} & known
+
+
+# --- the order of imports --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("package", "order"), [("torchdic", ROOMS), ("recon", RECON)])
+def test_every_room_has_its_place(package, order):
+    assert {room(path) for path in modules(package)} - {"__init__"} == set(order)
+
+
+@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
 def test_imports_point_down(path):
-    allowed = LAYERS if path.stem == "__init__" else LAYERS[: LAYERS.index(path.stem)]
-    own = {name.split(".")[1] for name in imported(path) if name.startswith("torchdic.")}
-    known = {p.stem for p in modules("torchdic")}
-    assert own & known <= set(allowed)
-    assert path.stem == "__init__" or "torchdic" not in imported(path), "a file names the layers that it uses"
+    if room(path) == "__init__":
+        return
+    assert rooms_imported(path, "torchdic") <= set(ROOMS[: ROOMS.index(room(path)) + 1])
+    assert "torchdic" not in imported(path), "a file names the room that it uses"
 
 
-@pytest.mark.parametrize("path", modules("torchdic"), ids=lambda p: p.stem)
-def test_torchdic_knows_neither_its_inverse_nor_its_specimens(path):
-    assert not packages(path) & {"recon", "data_synthetic"}
+@pytest.mark.parametrize("path", modules("recon"), ids=name_of)
+def test_imports_of_the_inverse_point_down(path):
+    if room(path) != "__init__":
+        assert rooms_imported(path, "recon") <= set(RECON[: RECON.index(room(path)) + 1])
 
 
-@pytest.mark.parametrize("path", modules("recon"), ids=lambda p: p.stem)
-def test_inverse_cannot_see_the_truth(path):
-    if path.name != "cli.py":
-        assert "data_synthetic" not in packages(path)
+@pytest.mark.parametrize("package", PACKAGES)
+def test_files_do_not_import_in_circles(package):
+    def dotted(path):
+        return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
-
-@pytest.mark.parametrize("path", modules("data_synthetic"), ids=lambda p: p.stem)
-def test_specimens_know_the_grid_and_no_more_of_torchdic(path):
-    """Their exact answers must not come from the models that they judge."""
-    assert "recon" not in packages(path)
-    own = {name.split(".")[1] for name in imported(path) if name.startswith("torchdic.")}
-    assert own <= {"grid"}
-
-
-@pytest.mark.parametrize("package", ["recon", "data_synthetic"])
-def test_files_of_a_package_do_not_import_in_circles(package):
-    known = {path.stem: path for path in modules(package)}
-    uses = {
-        stem: {n.split(".")[1] for n in imported(path) if n.startswith(f"{package}.")} & set(known)
-        for stem, path in known.items()
-        if stem != "__init__"
-    }
+    files = {dotted(path): path for path in modules(package)}
+    faces = {name for name, path in files.items() if path.name == "__init__.py"}
+    uses = {name: imported(path) & set(files) - {name} - faces for name, path in files.items() if name not in faces}
     placed: set[str] = set()
-    while ready := {stem for stem, needs in uses.items() if stem not in placed and needs <= placed | {stem}}:
+    while ready := {name for name, needs in uses.items() if name not in placed and needs <= placed}:
         placed |= ready
     assert placed == set(uses)
 
 
-def test_no_file_is_a_drawer_for_everything():
-    for package in ("torchdic", "recon", "data_synthetic"):
-        assert not {"utils", "helpers", "common", "misc"} & {path.stem for path in modules(package)}
+@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
+def test_torchdic_knows_neither_its_inverse_nor_its_specimens(path):
+    assert not packages(path) & {"recon", "data_synthetic"}
+
+
+@pytest.mark.parametrize("path", modules("recon"), ids=name_of)
+def test_inverse_cannot_see_the_truth(path):
+    if room(path) != "cli":
+        assert "data_synthetic" not in packages(path)
+
+
+@pytest.mark.parametrize("path", modules("data_synthetic"), ids=name_of)
+def test_specimens_know_the_grid_and_no_more_of_torchdic(path):
+    """Their exact answers must not come from the models that they judge."""
+    assert "recon" not in packages(path)
+    assert rooms_imported(path, "torchdic") <= {"grid"}
+
+
+@pytest.mark.parametrize("path", modules("torchdic/memory"), ids=name_of)
+def test_memory_knows_no_optics(path):
+    assert rooms_imported(path, "torchdic") <= {"errors", "grid", "memory"}
 
 
 def test_solver_and_viewer_stay_in_one_place():
     """torchdiffeq belongs to rays alone, and matplotlib to no physics."""
-    users = {path.stem for path in modules("torchdic") if "torchdiffeq" in packages(path)}
-    assert users == {"ray_solver"}
+    users = {name_of(path) for path in modules("torchdic") if "torchdiffeq" in packages(path)}
+    assert users == {"torchdic/rays/solver.py"}
     assert not any("matplotlib" in packages(path) for path in modules("torchdic"))
+
+
+def test_the_objective_alone_loads_no_solver():
+    """Nor do images by waves: only who traces rays loads torchdiffeq."""
+    script = (
+        "import sys, torch, torchdic.instrument.objective\n"
+        "assert 'torchdiffeq' not in sys.modules\n"
+        "from torchdic import Acquisition, Grid, Microscope, Volume, image\n"
+        "image(Volume(Grid((2, 8, 8), (1, 1, 1)), torch.zeros(2, 8, 8), 1.3), Microscope(0.5), Acquisition())\n"
+        "assert 'torchdiffeq' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True, cwd=ROOT)
+
+
+# --- size and names --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_folder_has_few_files(package):
+    files = Counter(path.parent for path in modules(package) if path.name != "__init__.py")
+    assert {folder: count for folder, count in files.items() if count > MOST_FILES} == {}
+
+
+def functions(tree, within=""):
+    """Every function, with its name and its class's."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.ClassDef):
+            yield from functions(node, f"{node.name}.")
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield f"{within}{node.name}", node
+            yield from functions(node, f"{within}{node.name}.")
+        else:
+            yield from functions(node, within)
+
+
+def lines_without_docstring(node):
+    lines = node.end_lineno - node.lineno + 1
+    first = node.body[0]
+    if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+        lines -= first.end_lineno - first.lineno + 1
+    return lines
+
+
+def test_functions_are_small():
+    """Parameters count without self and cls, lines without the docstring; the exceptions are still needed."""
+    larger = set()
+    for path in ALL:
+        for name, node in functions(parsed(path)):
+            taken = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+            parameters = len(taken) - (taken[:1] in (["self"], ["cls"]))
+            if parameters > MOST_PARAMETERS or lines_without_docstring(node) > MOST_LINES:
+                larger.add(name)
+    assert larger == set(LARGER)
+
+
+def test_no_file_is_a_drawer_for_everything():
+    assert not {"utils", "helpers", "common", "misc"} & {path.stem for path in ALL}
+
+
+def test_a_class_has_a_name_of_its_own():
+    """Two of one name would each be taken for the other."""
+    names = Counter(node.name for path in ALL for node in ast.walk(parsed(path)) if isinstance(node, ast.ClassDef))
+    assert {name: count for name, count in names.items() if count > 1} == {}
+
+
+def without_docstrings(tree):
+    """The strings of a file that are values."""
+    docs = {
+        id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    return [
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
+    ]
+
+
+@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
+def test_a_propagations_name_stands_in_its_places_alone(path):
+    names = {propagation.name for propagation in propagations()}
+    if not name_of(path).startswith(NAMED_IN):
+        assert not names & set(without_docstrings(parsed(path)))
+
+
+def test_rooms_hand_nothing_on():
+    """A name is imported from the file that defines it; only these faces hand names on."""
+    faces = {
+        name_of(path)
+        for path in ALL
+        if path.name == "__init__.py" and any(isinstance(node, ast.ImportFrom) for node in parsed(path).body)
+    }
+    assert faces == {
+        "torchdic/__init__.py",
+        "data_synthetic/__init__.py",
+        "recon/config/__init__.py",
+        "recon/cli/__init__.py",
+    }
 
 
 def test_public_names_keep_the_contract():
@@ -157,3 +283,16 @@ def test_public_names_keep_the_contract():
     assert len(set(torchdic.__all__)) == len(torchdic.__all__)
     public = {name for name, value in vars(torchdic).items() if name[0] != "_" and not inspect.ismodule(value)}
     assert public == set(torchdic.__all__)
+
+
+def test_errors_that_face_users_are_public():
+    """Whoever catches one imports it from torchdic."""
+    from torchdic import errors
+
+    raised = {
+        name
+        for name, value in vars(errors).items()
+        if inspect.isclass(value) and issubclass(value, Warning | Exception)
+    }
+    inner = {"BatchWarning"}
+    assert raised - inner <= set(torchdic.__all__)

@@ -332,6 +332,8 @@ def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level
 
     The curvature of "linear" is sampled beside the value and its gradient, not by a call of its own.
     """
+    for kind in ({}, {"object_aberration": method, "reference_plane": 0.0}):
+        taking(delta, **options, **kind)()  # at its first image a kind of scene is measured
     plain = counted(taking(delta, **options))
     without = taking(delta, **options, reference_plane=0.0)
     present = taking(delta, **options, reference_plane=0.0, object_aberration=method)

@@ -181,9 +181,9 @@ def test_rays_wait_once_a_step_for_torchdiffeq_and_twice_a_source_for_what_their
     few = waits("rays")
     assert waits("rays", planes=4) == few
     assert waits("rays", prisms=4) == few
-    assert waits("rays", slices=12) - few == Counter({"_local_scalar_dense in ray_solver.equal_steps": 6})
+    assert waits("rays", slices=12) - few == Counter({"_local_scalar_dense in solver._odeint": 6})
     more = waits("rays", sources=12) - few
-    assert more == Counter({"repeat_interleave in landing._covered_by_one": 6, "nonzero in landing._covered_by_one": 6})
+    assert more == Counter({"repeat_interleave in mesh._covered_by_one": 6, "nonzero in mesh._covered_by_one": 6})
     assert few.total() <= 12 + 6 + 2 * 6 + 16
 
 

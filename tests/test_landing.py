@@ -20,7 +20,8 @@ GRID = Grid((1, 13, 18), (1.0, 0.2, 0.25))
 def coverage(grid, displacement):
     """How many triangles cover each pixel, (source, y, x), and with what sum of orientations."""
     mesh = Mesh(grid, displacement)
-    source, triangle, pixel = mesh.covered(displacement)
+    pairs = mesh.covered(displacement)
+    source, triangle, pixel = pairs.source, pairs.triangle, pairs.pixel
     edges = mesh.edges(displacement)[source, triangle]
     sign = torch.sign(edges[:, 0, 1] * edges[:, 1, 0] - edges[:, 0, 0] * edges[:, 1, 1])
     shape = (len(displacement), *grid.shape[1:])

@@ -9,7 +9,18 @@ vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the
 beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
-from torchdic.errors import SamplingWarning, ShortOfMemoryError, ToleranceWarning
+from torchdic.errors import (
+    SamplingWarning,
+    ShortOfMemoryError,
+    SidewaysError,
+    SlabWarning,
+    StackError,
+    StackWarning,
+    ToleranceWarning,
+    TurnedRaysError,
+    UnstableError,
+    WrapAroundWarning,
+)
 from torchdic.fidelity import Fidelity
 from torchdic.forward.foresee import foreseen
 from torchdic.forward.images import image, image_field
@@ -54,11 +65,18 @@ __all__ = [
     "Rays",
     "SamplingWarning",
     "ShortOfMemoryError",
+    "SidewaysError",
+    "SlabWarning",
     "Spectrum",
+    "StackError",
+    "StackWarning",
     "ThinLens",
     "ToleranceWarning",
     "Trial",
+    "TurnedRaysError",
+    "UnstableError",
     "Volume",
+    "WrapAroundWarning",
     "foreseen",
     "image",
     "image_field",

@@ -154,7 +154,7 @@ def wavefront(
 
 
 def _launched(position: Tensor, momentum: Tensor) -> Rays:
-    return Rays(position, momentum, momentum.new_zeros(momentum.shape[:-1]))
+    return Rays(position.expand_as(momentum), momentum, momentum.new_zeros(momentum.shape[:-1]))
 
 
 def _cosine_behind(p: Tensor, n0: Tensor) -> Tensor:

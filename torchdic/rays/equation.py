@@ -52,7 +52,7 @@ class RayEquation:
 
     def meet(self, z: float, moving: Float[Tensor, "4 *ray"]) -> "Met":
         """What rays meet at depth z."""
-        y, x = self.positions(z, moving)
+        y, x = self._positions(z, moving)
         kappa = None if self.absorption is None else self.absorption.value(z, y, x)
         return self.momenta(moving, self.index.sample(z, y, x), kappa)
 
@@ -92,10 +92,19 @@ class RayEquation:
             torch.mul(self._swept(met), met.r, out=next(sums))
         return slopes
 
-    def pull_back(self, z: float, met: "Met", moves_bar: Tensor, sums_bar: Tensor, h: float) -> "Pulled":
+    def pull_back(
+        self,
+        z: float,
+        met: "Met",
+        moves_bar: Tensor,
+        sums_bar: Tensor,
+        sampled_bar: Tensor | None = None,
+        h: float = 1.0,
+    ) -> "Pulled":
         """The loss's derivatives in what was met at depth z, from those in `moves` and, h times, in the sums.
 
-        A name that ends in _bar is the loss's derivative in that value. moves_bar is used up.
+        A name that ends in _bar is the loss's derivative in that value. moves_bar is overwritten. sampled_bar: in what
+        was sampled, where the loss depends on it in other ways too.
         """
         _, gy, gx = met.sampled.unbind()
         n, pz, r, q, dp, (_, v, p0, _) = met.n, met.pz, met.r, met.q, met.dp, self._unperturbed
@@ -137,8 +146,9 @@ class RayEquation:
         if turned_bar is not None:
             p_bar.add_(turned_bar)
 
-        y, x = self.positions(z, met.moving)
-        place_bar, index_plane_bar = self.index.pull_back(z, y, x, index_bar)
+        y, x = self._positions(z, met.moving)
+        all_bar = index_bar if sampled_bar is None else index_bar + sampled_bar
+        place_bar, index_plane_bar = self.index.pull_back(z, y, x, all_bar)
         planes_bar = [index_plane_bar]
         if self.absorption is not None and kappa_bar is not None:
             further, kappa_plane_bar = self.absorption.pull_back_value(z, y, x, kappa_bar)
@@ -156,8 +166,7 @@ class RayEquation:
             background_bar = n_bar.sum() - self.background * path_bar.sum()
         return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
 
-    def positions(self, z: float, moving: Float[Tensor, "4 *ray"]) -> tuple[Float[Tensor, " *ray"], ...]:
-        """Where rays are at depth z: y and x in µm."""
+    def _positions(self, z: float, moving: Tensor) -> tuple[Tensor, Tensor]:
         place, v, _, _ = self._unperturbed
         y, x = torch.add(place, v, alpha=z - self.face).add_(moving[:2]).unbind()
         return y, x

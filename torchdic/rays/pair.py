@@ -61,17 +61,18 @@ class _PairFlight(Flight):
         sampler = _CurvedSampler(index.grid, index.slices, index.interpolation, index.first)
 
         def change(z: float, state: Tensor) -> Tensor:
-            return torch.cat((slopes(equation, z, state[:RAY]), _pair_slopes(equation, sampler, z, state)))
+            of_ray, sampled = slopes(equation, z, state[:RAY])
+            return torch.cat((of_ray, _pair_slopes(equation, sampler, z, state, sampled)))
 
         return equal_steps(change, state, depths, self.fidelity.solver)
 
 
-def _pair_slopes(equation: RayEquation, sampler: "_CurvedSampler", z: float, state: Tensor) -> Tensor:
-    """Q' and P', see the module's head; (8, …)."""
-    y, x = equation.positions(z, state[:MOVING])
-    delta, *along = sampler.sample(z, y, x)
+def _pair_slopes(equation: RayEquation, sampler: "_CurvedSampler", z: float, state: Tensor, sampled: Tensor) -> Tensor:
+    """Q' and P' of the module's head, (8, …); sampled: Δn and its derivatives where the rays are."""
+    straight, gradient = equation.straight, sampled[1:]
+    y, x = straight[:2] + (z - equation.face) * straight[2:4] + state[:2]
     yy, yx, xx = sampler.curvature(z, y, x)
-    n, p, gradient = equation.background + delta, equation.straight[4:6] + state[2:MOVING], torch.stack(along)
+    n, p = equation.background + sampled[0], straight[4:6] + state[2:MOVING]
     pz = (n * n - p.square().sum(0)).sqrt()
     g = n * gradient
     bend = n * torch.stack((yy, yx, yx, xx)).unflatten(0, (2, 2)) + gradient[:, None] * gradient[None]

@@ -57,7 +57,7 @@ def solve(
     tolerance, method = fidelity.tolerance, fidelity.solver
     try:
         return _odeint(
-            lambda z, s: slopes(equation, z, s),
+            lambda z, s: slopes(equation, z, s)[0],
             state,
             depths,
             rtol=tolerance,
@@ -73,8 +73,13 @@ def solve(
         return end
 
 
-def slopes(equation: RayEquation, z: float, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
-    """d(state)/dz at depth z in µm, differentiable in the state and in the equation's tensors."""
+def slopes(
+    equation: RayEquation, z: float, state: Float[Tensor, "component *ray"]
+) -> tuple[Float[Tensor, "component *ray"], Float[Tensor, "3 *ray"]]:
+    """d(state)/dz at depth z in µm, and what the rays meet there: Δn and its derivatives along y and x in 1/µm.
+
+    Both are differentiable in the state and in the equation's tensors.
+    """
     return _Evaluation.apply(equation, z, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
 
@@ -152,7 +157,7 @@ class _EqualSteps(torch.autograd.Function):
                 for j, stage_bar in zip(reversed(range(i + 1, len(b))), stage_bars, strict=True):
                     if a[j][i] != 0:
                         slopes_bar.add_(stage_bar, alpha=h * a[j][i])
-                pulled = equation.pull_back(stages[i], mets.pop(), slopes_bar, sums_bar, h * b[i])
+                pulled = equation.pull_back(stages[i], mets.pop(), slopes_bar, sums_bar, h=h * b[i])
                 gradients.add(stages[i], pulled)
                 stage_bars.append(pulled.moving)
             moving_bar = moving_bar + stage_bars[0]
@@ -163,20 +168,23 @@ class _EqualSteps(torch.autograd.Function):
 
 class _Evaluation(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, equation: RayEquation, z: float, state: Tensor, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, equation: RayEquation, z: float, state: Tensor, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         ctx.settings = _maker(equation), z
         ctx.save_for_backward(state, *tensors)
-        return equation.slopes(equation.meet(z, state[:MOVING]))
+        ctx.set_materialize_grads(False)
+        met = equation.meet(z, state[:MOVING])
+        return equation.slopes(met), met.sampled
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, slopes_bar: Tensor) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, slopes_bar: Tensor | None, sampled_bar: Tensor | None) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
         make, z = ctx.settings
         state, *tensors = ctx.saved_tensors
         equation, _ = make(tensors)
         gradients = _Gradients(equation)
-        moves_bar, sums_bar = slopes_bar[:MOVING].clone(), slopes_bar[MOVING:]
-        pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), moves_bar, sums_bar, 1.0)
+        slopes_bar = torch.zeros_like(state) if slopes_bar is None else slopes_bar
+        bars = slopes_bar[:MOVING].clone(), slopes_bar[MOVING:], sampled_bar
+        pulled = equation.pull_back(z, equation.meet(z, state[:MOVING]), *bars)
         gradients.add(z, pulled)
         return (None, None, torch.cat((pulled.moving, torch.zeros_like(state[MOVING:]))), *gradients.bars)
 
