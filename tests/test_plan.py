@@ -42,7 +42,7 @@ from torchdic.files.stack import read_volume
 from torchdic.planning import pilots
 from torchdic.planning.cost import work
 from torchdic.planning.image_error import FLOOR, image_error
-from torchdic.planning.ladders import PREDICTED, way_ladder
+from torchdic.planning.ladders import PILOT_SHARE, way_ladder
 from torchdic.planning.plan import describe
 
 GRID = Grid((16, 48, 48), (0.4, 0.2, 0.2))
@@ -554,7 +554,7 @@ def test_what_the_warning_says_to_ask_for_is_enough(tolerance):
     with pytest.warns(ToleranceWarning) as warned:
         made = plan(ball, Microscope(0.546, Objective(0.1)), acquisition, tolerance)
     (asked,) = re.findall(r"ask for ([\d.]+),", str(warned[0].message))
-    assert made.error <= PREDICTED * float(asked) < 1.1 * made.error
+    assert made.error <= PILOT_SHARE * float(asked) < 1.1 * made.error
     assert plan(ball, Microscope(0.546, Objective(0.1)), acquisition, float(asked)).met
 
 

@@ -1,4 +1,4 @@
-"""What an image costs: its work, by counting, and its seconds, by timing a small part of it."""
+"""What an image costs: its work, which is counted, and its seconds, for which a small part of it is timed."""
 
 import math
 import time
@@ -13,22 +13,20 @@ from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.propagation.base import propagation_of
 from torchdic.specimen.volume import Volume
 
-# Work in units of one FFT of a source's field, pointwise work included, measured on a CPU from 64² to 256² pixels. What
-# crosses the specimen is for each propagation to say.
+# Work of a source and of each of its images, in FFTs of a field with pointwise work included, measured on a CPU from
+# 64² to 256² pixels. Each propagation says by itself what its way across the specimen costs.
 SETUP, IMAGE = 30.0, 4.5
 
-# More, for each pure state of polarised light in an image, or for its two beams at once where they stay a scalar pair.
+# The work that polarisers add: for each pure state of light in an image; once for both beams where light is a scalar.
 POLARISED = 8.0
 
-# Work of the part that is timed: some 10 ms, beyond what calls alone take.
+# Work of the part that is timed. It takes some 10 ms, much more than the calls of Python alone.
 TIMED = 3e7
 
 
 def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition: Acquisition) -> float:
-    """What an image costs, in FFT butterflies: sources × (what crosses the specimen + images) × N log2 N."""
-    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
-    pixels = math.prod(grid.shape[1:])
-    inside = propagation_of(fidelity).work(grid, fidelity, absorbs=volume.absorption is not None)
+    """What an image costs, in FFT butterflies: sources × (crossing the specimen + images) × N log2 N, for N pixels."""
+    pixels = math.prod(volume.grid.widened(fidelity.padding, fidelity.padding).shape[1:])
     polarisers = microscope.polarisers
     if microscope.lenses is not None:
         states = 1 if polarisers is None else polarisers.states
@@ -36,19 +34,26 @@ def work(fidelity: Fidelity, volume: Volume, microscope: Microscope, acquisition
         states = 0 if polarisers is None else 1
     images = len(acquisition.prisms) * len(acquisition.focus) * (IMAGE + POLARISED * states)
     sources = len(microscope.colours()) * directions(microscope, fidelity.sources)
-    return sources * (SETUP + inside + images) * pixels * math.log2(max(pixels, 2))
+    return sources * (SETUP + crossing(fidelity, volume) + images) * pixels * math.log2(max(pixels, 2))
+
+
+def crossing(fidelity: Fidelity, volume: Volume) -> float:
+    """What the light of each source costs inside the specimen, in FFTs of a field."""
+    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
+    return propagation_of(fidelity).work(grid, fidelity, absorbs=volume.absorption is not None)
 
 
 def directions(microscope: Microscope, sources: int) -> int:
-    """How many directions the light comes from if at most so many are asked for."""
+    """The number of directions that the light comes from if at most `sources` are asked for."""
     return len(microscope.sources(sources)[1])
 
 
 @torch.no_grad()
 def seconds(volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity) -> float:
-    """Seconds of an image without gradients: those of a few sources, slabs and one focus, scaled by the work.
+    """The seconds that an image will take, without its gradient.
 
-    They cross an empty volume: few slabs need not carry the light of a strong specimen.
+    An image of few sources, few slabs and one focus plane is timed, and its seconds are scaled by the work. Its volume
+    is empty, because few slabs may not carry the light of a strong specimen.
     """
     absorption = None if volume.absorption is None else torch.zeros_like(volume.delta)
     empty = Volume(volume.grid, torch.zeros_like(volume.delta), volume.background.detach(), absorption)
@@ -63,7 +68,7 @@ def seconds(volume: Volume, microscope: Microscope, acquisition: Acquisition, fi
 
 
 def timed(run: Callable[[], object], repeats: int, device: torch.device) -> list[float]:
-    """Seconds of each of several runs, by the clock, until the device is done."""
+    """The seconds that each of several runs takes by the clock, until the device is done with it."""
 
     def done() -> float:
         if device.type == "cuda":

@@ -1,4 +1,4 @@
-"""A scene, and the smaller ones that stand for it: its busiest window, its hardest images, few of its sources."""
+"""A scene, and smaller ones (pilots) that stand for it: its busiest window, its hardest images, few of its sources."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -13,23 +13,25 @@ from torchdic.forward.images import image
 from torchdic.grid import Grid
 from torchdic.instrument.condenser import Spectrum
 from torchdic.instrument.microscope import Acquisition, Microscope
-from torchdic.planning.comparisons import TRUTH
+from torchdic.planning.comparisons import CANNOT_CROSS, TRUTH
+from torchdic.planning.cost import work
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
-# Voxels along each side of a pilot's window; the whole array if it isn't much wider.
+# Voxels along each side of a pilot's window. An array that isn't much wider is taken whole.
 WINDOW = 64
 
-# Slabs at least of pilots that ask about something other than slabs.
+# The least number of slabs in a pilot that answers a question about something other than slabs.
 COARSE = 4
 
-# Slabs to a slice beyond which a pilot looks for nothing more, and for as many as carry the light at all.
+# The most slabs for each slice that a pilot tries: to see whether its image still changes; and to find slabs thin
+# enough to carry the light at all.
 MOST, MOST_UNSTABLE = 8, 32
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A volume, the microscope and what is recorded; images that were computed once are kept."""
+    """A volume, the microscope and what is recorded. Each image is computed once and kept."""
 
     volume: Volume
     microscope: Microscope
@@ -38,7 +40,7 @@ class Scene:
     _unstable: set[Fidelity] = field(default_factory=set, init=False)
 
     def __call__(self, fidelity: Fidelity) -> Tensor:
-        """Images, (prism, focus, y, x). Raises UnstableError as `image` does."""
+        """Images, (prism, focus, y, x). Raises what `image` raises, UnstableError where slabs don't carry the light."""
         if fidelity not in self._seen:
             try:
                 self._seen[fidelity] = image(self.volume, self.microscope, self.acquisition, fidelity)
@@ -49,17 +51,30 @@ class Scene:
 
     @property
     def slices(self) -> int:
-        """Slices of the volume."""
+        """The number of slices of the volume."""
         return self.volume.grid.shape[0]
 
+    def work(self, fidelity: Fidelity) -> float:
+        """What the scene's images cost with a fidelity, see `torchdic.planning.cost.work`."""
+        return work(fidelity, self.volume, self.microscope, self.acquisition)
+
+    def changed(self, **parts: float | None) -> "Scene":
+        """The scene with some parts of its microscope changed; None takes a part away."""
+        return replace(self, microscope=replace(self.microscope, **parts))
+
+    def transparent(self) -> "Scene":
+        """The scene with a specimen that doesn't absorb."""
+        return replace(self, volume=Volume(self.volume.grid, self.volume.delta, self.volume.background))
+
     def nothing(self) -> Tensor:
-        """Images of nan, for what can't be computed; a pixel each, as wide as any others beside them."""
+        """What stands for images that can't be computed: one pixel of nan each, which broadcasts to any size."""
         return self.volume.delta.new_full((len(self.acquisition.prisms), len(self.acquisition.focus), 1, 1), math.nan)
 
     def coarse(self) -> Iterator[Fidelity]:
-        """Fidelities for what has nothing to do with slabs, from the cheapest on: a strong specimen asks for a finer.
+        """Fidelities for questions that aren't about slabs, from coarse slabs to fine ones.
 
-        The first has slabs half as deep as the objective's field or thinner.
+        The slabs of the first one are at most as deep as half the objective's depth of field; a strong specimen may
+        need finer ones.
         """
         grid, n0, objective = self.volume.grid, number(self.volume.background), self.microscope.objective
         na = n0 if objective is None else objective.na
@@ -67,14 +82,15 @@ class Scene:
         steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
         while steps < MOST_UNSTABLE * self.slices:
             yield Fidelity(TRUTH, steps=steps, order=1)
-            yield Fidelity(TRUTH, steps=steps)  # often carries light where the first order makes energy
+            yield Fidelity(TRUTH, steps=steps)  # the second order often carries light where the first makes energy
             steps *= 2
         yield Fidelity(TRUTH, steps=MOST_UNSTABLE * self.slices)
 
     def hardest(self) -> "Scene":
-        """The scene with the hardest of its images, in two colours at most.
+        """The scene with the hardest of its images only, in at most two colours.
 
-        They are those of the darkest, brightest and most sheared prism, at the farthest focus and the nearest.
+        They are those of the darkest, the brightest, the most sheared and the last prism, at the lowest and the highest
+        focus and at the one that is nearest to the specimen.
         """
         prisms = self.acquisition.prisms
         levels = [1.0 if p is None else math.sin(number(p.bias) / 2) ** 2 for p in prisms]
@@ -89,7 +105,7 @@ class Scene:
         return replace(self, acquisition=hardest, microscope=_in_two_colours(self.microscope))
 
     def lit(self, sources: int) -> "Scene":
-        """The scene with so many sources at most, a few of the condenser's own where it names them."""
+        """The scene with at most so many sources; where the condenser names its own, some of those."""
         condenser = self.microscope.condenser
         if condenser is None:
             return self
@@ -101,7 +117,7 @@ class Scene:
         return replace(self, microscope=self.microscope.lit_from(points, weights))
 
     def halves(self) -> "list[Scene]":
-        """Two scenes with every other of the condenser's own sources each; itself where it names fewer than two."""
+        """Two scenes, each with every other of the condenser's own sources; the scene itself if it has at most one."""
         condenser = self.microscope.condenser
         if condenser is None or condenser.points is None or len(condenser.points) < 2:
             return [self]
@@ -110,23 +126,23 @@ class Scene:
 
     @property
     def strained(self) -> bool:
-        """Whether some slabs that were tried don't carry its light."""
+        """Whether some of the slabs that were tried didn't carry its light."""
         return bool(self._unstable)
 
     def carries(self, fidelity: Fidelity) -> bool:
-        """Whether a fidelity's slabs carry the light of all its sources."""
+        """Whether light of all the scene's sources can cross the specimen with a fidelity."""
         one = Acquisition(self.acquisition.prisms[:1], self.acquisition.focus[:1])
         try:
             replace(self, acquisition=one)(replace(fidelity, padding=0))
-        except UnstableError:
+        except CANNOT_CROSS:
             return False
         return True
 
     def window(self, side: int = WINDOW) -> "Scene":
-        """The scene in a part of its volume, about `side` voxels wide, where Δn varies most.
+        """The scene with only a part of its volume, about `side` voxels wide, where Δn varies most.
 
-        Towards its own sides it fades into the mean along them, so that layers get no edges. An axis up to a quarter as
-        long again is kept whole. Two of a camera's pixels fit in.
+        Toward its sides the part fades into the mean along them, so that a layered specimen gets no edges. An axis of
+        up to 1.25·side voxels is kept whole. The part is wide enough for two pixels of the camera.
         """
         volume, camera = self.volume, self.microscope.camera
         shape, (dy, dx) = volume.grid.shape, volume.grid.spacing[1:]
@@ -142,7 +158,7 @@ class Scene:
         fade = _fade(size, shape[1:]).to(strength)
         weight = torch.zeros_like(busy)
         weight[: size[0], : size[1]] = fade.square()
-        # the array is periodic: a window may lie across its sides, where a specimen that reaches them has an edge
+        # the array is periodic: a window may lie across its sides, where a specimen that reaches them may have an edge
         sums = torch.fft.irfft2(torch.fft.rfft2(busy) * torch.fft.rfft2(weight).conj(), s=shape[1:])
         rows, columns = (n if length < n else 1 for length, n in zip(size, shape[1:], strict=True))
         row, column = divmod(int(sums[:rows, :columns].argmax()), columns)
@@ -160,9 +176,10 @@ class Scene:
 
 
 def _in_two_colours(microscope: Microscope) -> Microscope:
-    """A microscope with two wavelengths at most: the shortest, which asks for the thinnest slabs, and a mean.
+    """A microscope with at most two wavelengths.
 
-    They stand for the shorter and the longer half of those that are lit, with their shares.
+    The shortest one, which needs the thinnest slabs, stands for the shorter half of those that are lit; the mean of the
+    longer half stands for that half. Each has its half's share of the light.
     """
     spectrum = microscope.spectrum
     if spectrum is None or len(spectrum.wavelengths) <= 2:
@@ -176,7 +193,7 @@ def _in_two_colours(microscope: Microscope) -> Microscope:
 
 
 def _fade(size: Sequence[int], full: Sequence[int]) -> Tensor:
-    """A factor (y, x) that rises from the sides of a part of an array; 1 along whole axes."""
+    """A factor (y, x) that rises from 0 at the sides of a part of an array to 1 inside; 1 along axes kept whole."""
     ramps = []
     for length, whole in zip(size, full, strict=True):
         ramp = torch.ones(length)

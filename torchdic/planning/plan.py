@@ -1,12 +1,12 @@
-"""The cheapest Fidelity that meets a tolerance, and which effects the scene calls for.
+"""The cheapest Fidelity that meets a tolerance, and which effects a scene needs.
 
-The error of images is one number: at each prism and focus plane the rms difference from the truth over the standard
-deviation of the true image, and of these the largest. The truth is the wave's own converged answer (thin slabs, second
-order, many sources, wide sides), since it contains bending, amplitude and diffraction.
+The error of images is one number, see `torchdic.planning.image_error`. The truth is the wave's own converged image, of
+thin slabs in second order, many sources and wide sides, because it contains bending, amplitude and diffraction.
 
-Nothing is looked up by a specimen's name. Small pilots are run instead, with a few prisms and focus planes, on a window
-where the specimen is busiest (`torchdic.pilots`); they climb ladders of sources, of slabs and of sides until the image
-stands still (`torchdic.ladders`), and tell what each effect is worth (`torchdic.effects`).
+Nothing is looked up by a specimen's name. Small images, the pilots, are computed instead: with a few prisms and focus
+planes, in a window where the specimen is busiest (`torchdic.planning.pilots`). Their sources, slabs and sides are
+refined one after the other until the image stands still (`torchdic.planning.ladders`), and they tell what each effect
+is worth (`torchdic.planning.effects`).
 """
 
 import math
@@ -22,11 +22,12 @@ import torch
 from torchdic.errors import SamplingWarning, SlabWarning, ToleranceWarning, UnstableError, WrapAroundWarning
 from torchdic.fidelity import Fidelity
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, check_sampling
-from torchdic.planning.cost import directions, seconds, work
-from torchdic.planning.effects import Climbed, Effect, counted, effects
+from torchdic.planning.cost import seconds
+from torchdic.planning.effects import Effect, effects
 from torchdic.planning.image_error import relative
-from torchdic.planning.ladders import PREDICTED, Choice, side_ladder, source_ladder, sparse, way_ladder
+from torchdic.planning.ladders import PILOT_SHARE, Climbed, climb
 from torchdic.planning.pilots import Scene
+from torchdic.planning.worth import PlannedScene, counted
 from torchdic.propagation.base import propagation_of
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
@@ -34,10 +35,15 @@ from torchdic.specimen.volume import Volume
 
 @dataclass(frozen=True)
 class Plan:
-    """The cheapest fidelity that meets a tolerance, with what it is expected to give.
+    """The cheapest fidelity that meets a tolerance, and what to expect of it.
 
-    error: predicted, as `torchdic.image_error` defines it. seconds: of one `image` without gradients, predicted. met:
-    whether the tolerance is. planning: seconds that the plan took.
+    fidelity: what to call `torchdic.image` with.
+    effects: what each effect of the scene is worth, in the order of the table.
+    error: of the images, predicted; see `torchdic.planning.image_error`.
+    seconds: predicted, of one image without its gradient.
+    tolerance: the largest error that was asked for.
+    met: whether the predicted error is so far below the tolerance that the images are sure to meet it.
+    planning: seconds that it took to make the plan.
     """
 
     fidelity: Fidelity
@@ -49,7 +55,7 @@ class Plan:
     planning: float = field(compare=False)
 
     def table(self) -> str:
-        """The effects as text, a row each, and what was chosen."""
+        """The effects as text, one row each, and below them the fidelity that was chosen."""
         lines = [f"{'effect':<18}{'needed':<8}{'error without':>14}{'cost':>7}  how it is known"]
         for e in self.effects:
             error = "—" if e.basis == "absent" else f"{'≤ ' if e.basis == 'bound' else ''}{e.error:.2g}"
@@ -66,7 +72,7 @@ class Plan:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """What JSON can hold."""
+        """The plan as values that JSON can hold."""
         return {
             "fidelity": dict(vars(self.fidelity)),
             "effects": [dict(vars(e)) for e in self.effects],
@@ -75,7 +81,7 @@ class Plan:
 
 
 def describe(fidelity: Fidelity) -> str:
-    """A fidelity's choices in a line."""
+    """A fidelity in one line of words."""
     parts = [f'"{fidelity.propagation}"', *propagation_of(fidelity).describe(fidelity)]
     parts.append(counted(fidelity.sources, "source"))
     if fidelity.padding:
@@ -85,13 +91,20 @@ def describe(fidelity: Fidelity) -> str:
 
 @torch.no_grad()
 def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
-    """The cheapest Fidelity whose images err by at most `tolerance`, and what each effect is worth.
+    """Find the cheapest Fidelity whose images err by at most `tolerance`, and what each effect is worth.
 
-    The error is that of `torchdic.image_error`, against the wave on the same voxels: what voxels too coarse for the
-    specimen lose is not in it. Where the specimen stays clear of the sides the truth is the specimen alone in its
-    medium; where it reaches them, the periodic array that `image` computes without padding. Nothing in it is random,
-    and no choice hangs on a clock. Raises ValueError for a tolerance that isn't positive, and as `image` does. Warns
-    ToleranceWarning where no fidelity is sure to meet the tolerance: the plan is then the best one found.
+    volume: the specimen.
+    microscope: with which it is seen.
+    acquisition: the prism settings and focus planes (µm) that are recorded.
+    tolerance: the largest error of an image, as a part of its contrast, above 0: 0.05 is 5 % of the image's standard
+        deviation; see `torchdic.planning.image_error`.
+
+    Images are compared with the wave's converged ones on the same voxels: what is lost where voxels are too coarse for
+    the specimen doesn't count. Where the specimen stays clear of the volume's sides, the truth is the specimen alone in
+    its medium; where it reaches them, the truth is the periodic array that `image` computes without padding. The same
+    scene gives the same fidelity each time: nothing is random, and no choice depends on a clock.
+    Raises ValueError for a tolerance that isn't positive and finite, and what `image` raises. Warns with
+    ToleranceWarning where no fidelity is sure to meet the tolerance; the plan is then the best one found.
     """
     if not (isinstance(tolerance, Real) and 0 < tolerance < math.inf):
         raise ValueError(f"tolerance {tolerance} must be above 0, and finite")
@@ -108,9 +121,9 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
         worst = max(chosen.effects, key=lambda e: e.error)
         warnings.warn(
             f"no fidelity tried is sure to meet the tolerance {tolerance:g}, which takes a predicted error of "
-            f"{PREDICTED * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
+            f"{PILOT_SHARE * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
             f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for "
-            f"{_two_digits_up(chosen.error / PREDICTED)}, or take finer voxels, a narrower condenser or wider sides",
+            f"{_two_digits_up(chosen.error / PILOT_SHARE)}, or take finer voxels, a narrower condenser or wider sides",
             ToleranceWarning,
             stacklevel=3,
         )
@@ -118,60 +131,35 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
 
 
 def _plan(scene: Scene, tolerance: float) -> Plan:
+    """A scene's plan; slabs that don't carry the light are made finer until they do."""
     pilot = scene.hardest().window()
     slabs = pilot.coarse()
     coarse = next(slabs)
     while True:
         try:
-            climbed = _climb(scene, pilot, coarse, tolerance)
+            climbed = climb(scene, pilot, coarse, tolerance)
             fidelity, error = _cheapest(scene, pilot, climbed, tolerance)
-            worth = effects(scene, climbed, fidelity, tolerance)
+            worth = effects(PlannedScene(scene, climbed, fidelity, tolerance))
             break
         except UnstableError:
             finer = next(slabs, None)
             if finer is None:
                 raise
             coarse = finer
-    met = error <= PREDICTED * tolerance
+    met = error <= PILOT_SHARE * tolerance
     duration = seconds(scene.volume, scene.microscope, scene.acquisition, fidelity)
     return Plan(fidelity, worth, error, duration, tolerance, met, 0.0)
 
 
-def _climb(scene: Scene, pilot: Scene, coarse: Fidelity, tolerance: float) -> Climbed:
-    """The three ladders of a scene; the pilot's `coarse` slabs serve the questions that aren't about slabs."""
-    counts, dense = source_ladder(pilot, coarse, tolerance)
-    few = sparse(pilot, counts, dense)
-    ways, truth = way_ladder(few, tolerance)
-    if counts:
-        # the truth's image with all its sources, by what they change in the coarse one
-        truth = truth + dense - few(coarse)
-    else:
-        counts = [Choice(replace(coarse, sources=directions(scene.microscope, 1)), torch.zeros_like(truth))]
-    whole = replace(scene, microscope=pilot.microscope, acquisition=pilot.acquisition)
-    sides = side_ladder(whole, coarse, tolerance)
-    return Climbed(few, coarse, truth, ways, counts, sides)
-
-
 def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) -> tuple[Fidelity, float]:
-    """The cheapest choice whose error stays within its part of the tolerance, or else the best, with its error.
+    """The cheapest choice whose error is a small enough part of the tolerance, with that error; otherwise the best one.
 
     pilot: with all of the condenser's sources, because slabs that carry the light of a few may not carry that of all.
     """
-
-    def joined() -> Iterator[tuple[Fidelity, float]]:
-        for way in climbed.ways:
-            for count in climbed.counts:
-                error = relative(way.lacks + count.lacks, climbed.truth)
-                for side in climbed.sides:
-                    choice = replace(way.fidelity, sources=count.fidelity.sources, padding=side.padding)
-                    yield choice, math.hypot(error, count.beyond, side.error(choice.sources))
-
-    def cost(choice: tuple[Fidelity, float]) -> float:
-        return work(choice[0], scene.volume, scene.microscope, scene.acquisition)
-
     strained = pilot.strained or climbed.pilot.strained
-    tried = list(joined())
-    meeting = sorted((choice for choice in tried if choice[1] <= PREDICTED * tolerance), key=cost)
+    tried = list(_joined(climbed))
+    meeting = [choice for choice in tried if choice[1] <= PILOT_SHARE * tolerance]
+    meeting.sort(key=lambda choice: scene.work(choice[0]))
     for choice in (*meeting, *sorted(tried, key=lambda choice: choice[1])):
         if not strained or pilot.carries(choice[0]):
             return choice
@@ -179,8 +167,18 @@ def _cheapest(scene: Scene, pilot: Scene, climbed: Climbed, tolerance: float) ->
     raise UnstableError(f"no number of slabs up to {most} carries the light of all sources")
 
 
+def _joined(climbed: Climbed) -> Iterator[tuple[Fidelity, float]]:
+    """Every way with every number of sources and every padding, and its error."""
+    for way in climbed.ways:
+        for count in climbed.counts:
+            error = relative(way.lacks + count.lacks, climbed.truth)
+            for side in climbed.sides:
+                choice = replace(way.fidelity, sources=count.fidelity.sources, padding=side.padding)
+                yield choice, math.hypot(error, count.beyond, side.error(choice.sources))
+
+
 def _two_digits_up(value: float) -> str:
-    """A value to two digits, rounded up, so that asking for it is enough; as it is where it isn't finite."""
+    """A value rounded up to two digits, so that it is enough to ask for; 0, inf and nan stay as they are."""
     if not 0 < value < math.inf:
         return f"{value:g}"
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)
@@ -188,5 +186,6 @@ def _two_digits_up(value: float) -> str:
 
 
 def _detached(volume: Volume) -> Volume:
+    """The volume without a graph."""
     absorption = None if volume.absorption is None else volume.absorption.detach()
     return Volume(volume.grid, volume.delta.detach(), volume.background.detach(), absorption)
