@@ -348,6 +348,7 @@ def test_object_aberration_costs_one_map_an_image_and_a_transform_for_each_level
     assert extra == map_ + Counter(fft2=len(found.defocus) - 1)
     assert 8 < len(found.defocus) < 12
     many = taking(delta, directions(8), **options, reference_plane=0.0, object_aberration=method)
+    many()
     assert counted(many) == counted(present)
     assert float((present() - without()).abs().max()) > 1e-4
     kept_, more = (kept(taking(delta, learned=True, **options, object_aberration=m)) for m in (None, method))

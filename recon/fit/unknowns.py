@@ -20,7 +20,7 @@ from recon.fit.start import linear_start
 from torchdic import Acquisition, Grid, Microscope, Volume
 
 # Distance in Δn from its bounds that every voxel starts with.
-MARGIN = 1e-3
+OFF_BOUNDS = 1e-3
 
 # What goes on from one step to the next: of each unknown, by its name, the parameter and Adam's moments.
 State = dict[str, dict[str, Any]]
@@ -81,13 +81,13 @@ class IndexDifference(Unknown):
     name = "delta"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:
-        """The parameter of the first volume, MARGIN away from the bounds."""
+        """The parameter of the first volume, OFF_BOUNDS away from the bounds."""
         volume, microscope, acquisition = setup
         if self.first == "linear":
             delta = linear_start(misfit.data, volume.grid, volume.background, microscope, acquisition)
         else:
             delta = misfit.data.new_zeros(volume.grid.shape)
-        return self.bounds.parameter(delta, margin=MARGIN)
+        return self.bounds.parameter(delta, margin=OFF_BOUNDS)
 
     def value(self, parameter: Tensor) -> Tensor:
         """Δn within its bounds."""

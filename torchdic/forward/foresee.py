@@ -1,48 +1,39 @@
-"""Memory foreseen: what an image will hold at once, measured on a sample of the scene before it is computed.
+"""Memory foreseen: what an image will hold at once, and whether there is room for it, before it is computed.
 
-The sample is the scene itself, with all of its slices, prisms and focus planes, but on few pixels and lit by one source
-or two. It is run, with its gradient where one is wanted, while the bytes that it holds are counted
-(`torchdic.memory.held`). Its pixels and sources are then scaled to the scene's: bytes grow in proportion to the pixels,
-and linearly with the sources of a batch. What a sample holds hangs on the scene's shapes and not on its values, so each
-kind of scene is measured once.
+It is measured on a small sample of the scene, see `torchdic.forward.sample`. What a sample holds depends on the scene's
+shapes and not on its values, so each kind of scene is measured once.
 """
 
 import math
-import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.forward.passage import FieldPassage, Passage
+from torchdic.forward.sample import Sample, VolumeSample, field_sample
 from torchdic.grid import Grid
-from torchdic.imaging import passband
 from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.memory.budget import Batches, Foreseen, fitted, least_of
 from torchdic.memory.free import check_room, free_bytes
-from torchdic.memory.held import Course, course_of, extrapolated, most
-from torchdic.memory.signature import signature, stand_in
+from torchdic.memory.signature import is_learned, signature
 from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
 from torchdic.specimen.volume import Volume
 
-# Pixels along a side of the sample: about so many, and as many as the scene has where those are fewer.
-SIDES = range(36, 53)
 # Bytes that a batch on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches, up to 1.4
 # times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
-# More bytes than any scene holds for each source and pixel, and for each slice and image where a gradient is wanted. A
+# More bytes than any scene holds for each pixel and source, and for each slice and image where a gradient is wanted. A
 # scene that fits into its budget even so is computed at once and not measured.
 AMPLE = 2048
-# The same for the map of an object aberration, which serves all sources: as many times AMPLE for each slice.
+# The same for the map of an object aberration, which serves all sources: as many times AMPLE for each pixel and slice.
 MAP = 40
 # Kinds of scenes whose measurements are kept.
 KEPT = 32
-_measured: "OrderedDict[Hashable, _Sample]" = OrderedDict()
+_measured: "OrderedDict[Hashable, Sample]" = OrderedDict()
 
 
 def foreseen(
@@ -55,153 +46,114 @@ def foreseen(
 ) -> Foreseen:
     """What `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
 
-    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad. An
-    object_aberration of the fidelity is found, because the memory depends on how strong it is.
+    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad.
+    An object_aberration of the fidelity is found, because the memory depends on how strong it is.
     """
     levels = 0
     if fidelity.object_aberration is not None:
         with torch.no_grad():
             levels = Passage.through(volume, microscope, acquisition, fidelity).most_levels
     with torch.set_grad_enabled(torch.is_grad_enabled() if gradient is None else gradient):
-        sample = _sample_of(volume, microscope, acquisition, fidelity, levels, learned=bool(gradient))
-        return sample.foreseen(fidelity.memory)
+        room = _room_for(volume, microscope, acquisition, fidelity, levels, learned=bool(gradient))
+        return room.foreseen(fidelity.memory)
 
 
 def allot(
-    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int | None = None
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 0
 ) -> Batches:
     """The batches in which `image` computes within its budget and what is free.
 
-    levels: of an object aberration; None where it isn't known yet. Raises ShortOfMemoryError where even single sources,
+    levels: of an object aberration, as far as they are known. Raises ShortOfMemoryError where even single sources,
     their steps computed again, want more than is free.
     """
-    grid, device = volume.grid.widened(fidelity.padding, fidelity.padding), volume.delta.device
+    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
     slices, images = grid.shape[0], len(acquisition.prisms) * len(acquisition.focus)
-    sources, gradient = len(microscope.sources(fidelity.sources)[1]), torch.is_grad_enabled()
-    of_source = slices + images + (levels or 0) if gradient else 1
-    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if gradient else 1)
-    free = free_bytes(device)
-    if _ample(sources * of_source + of_map, grid, fidelity, device, free):
-        return Batches(sources)
+    room = _room_for(volume, microscope, acquisition, fidelity, levels)
+    of_source = slices + images + levels if room.gradient else 1
+    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if room.gradient else 1)
     shape = "×".join(map(str, volume.grid.shape))
     what = (
         f"{len(acquisition.prisms)} prism settings × {len(acquisition.focus)} focus planes of {shape} voxels by "
         f'"{fidelity.propagation}"'
     )
-    sample = _sample_of(volume, microscope, acquisition, fidelity, levels or 0)
-    sample.check_room(free, what)
-    return sample.fitted(fidelity.memory, free)
+    return room.allot(room.sources * of_source + of_map, grid, fidelity.memory, what)
 
 
 def allot_fields(passage: FieldPassage) -> Batches:
     """As `allot`, for the images of fields that are there already."""
-    fidelity, acquisition, device = passage.fidelity, passage.acquisition, passage.transmission.device
+    fidelity, acquisition = passage.fidelity, passage.acquisition
     grid = passage.grid.widened(fidelity.padding, fidelity.padding)
     prisms, planes = len(acquisition.prisms), len(acquisition.focus)
-    sources, free = len(passage.microscope.sources(fidelity.sources)[1]), free_bytes(device)
-    kept = sources * (prisms * planes if torch.is_grad_enabled() else 1)
-    if _ample(kept, grid, fidelity, device, free):
-        return Batches(sources)
+    parts = passage.grid, passage.transmission, passage.background, passage.microscope, acquisition
+    sources = len(passage.microscope.sources(fidelity.sources)[1])
+
+    def make() -> Sample:
+        run, scale = field_sample(passage)
+        return Sample(run, sources, scale, apart=passage.transmission.ndim == 3)
+
+    key = signature(parts), replace(fidelity, memory=1)
+    room = _Room(key, make, sources, passage.transmission.device, is_learned(parts), small_batches=False)
     _, ny, nx = passage.grid.shape
-    sample = _sample_of_fields(passage)
-    sample.check_room(free, f"{prisms} × {planes} images of {ny}×{nx} pixels")
-    return sample.fitted(fidelity.memory, free)
+    kept = sources * (prisms * planes if room.gradient else 1)
+    return room.allot(kept, grid, fidelity.memory, f"{prisms} × {planes} images of {ny}×{nx} pixels")
 
 
-def _ample(kept: int, grid: Grid, fidelity: Fidelity, device: torch.device, free: int | None) -> bool:
-    """Whether all sources fit into the budget at once, whatever is done with them; kept: see AMPLE."""
-    return AMPLE * kept * math.prod(grid.shape[1:]) <= _budget(fidelity.memory, free, device)
+@dataclass(frozen=True)
+class _Room:
+    """The room that a scene takes, measured when it is asked for.
 
-
-def _budget(memory: int, free: int | None, device: torch.device) -> int:
-    """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""
-    budget = memory if free is None else max(1, min(memory, free))
-    return min(budget, CACHED) if device.type == "cpu" and not torch.is_grad_enabled() else budget
-
-
-# --- the sample ------------------------------------------------------------------------------------------------------
-
-# Runs a sample of so many sources in batches, and its gradient if one is wanted.
-Run = Callable[[int, Batches], None]
-
-
-class _Sample:
-    """A scene's sample, and what it was found to hold.
-
-    run: computes the sample. sources: of the scene. scale: pixels of the scene to one of the sample. apart: whether
-    every source has a field of its own, which is held beside the batches.
+    kind: scenes of one kind hold the same. make: makes the sample of such a scene. sources: of the scene. gradient:
+    whether one is wanted. small_batches: see `torchdic.memory.budget.ways`.
     """
 
-    def __init__(
-        self,
-        run: Run,
-        sources: int,
-        scale: float,
-        device: torch.device,
-        *,
-        small_batches: bool = False,
-        apart: bool = False,
-    ) -> None:
-        self._run, self._sources, self._scale, self._device = run, sources, scale, device
-        self._small_batches, self._apart = small_batches, apart
-        self._gradient = torch.is_grad_enabled()
-        self._courses: dict[tuple[int, Batches], Course] = {}
+    kind: Hashable
+    make: Callable[[], Sample]
+    sources: int
+    device: torch.device
+    gradient: bool
+    small_batches: bool
 
     def foreseen(self, memory: int) -> Foreseen:
         """What the scene holds within a budget in bytes."""
-        batches = self._fitted(_budget(memory, None, self._device))
-        return Foreseen(self.peak(batches), self._least, batches.sources, batches.slabs)
+        batches = self._fitted(self._budget(memory, None))
+        return Foreseen(self._peak(batches), self._least, batches.sources, batches.slabs)
 
-    def check_room(self, free: int | None, what: str) -> None:
-        """Raise ShortOfMemoryError where the scene can't be computed in what is free."""
-        if free is not None and self.peak(Batches(self._sources)) > free:
+    def allot(self, kept: int, grid: Grid, memory: int, what: str) -> Batches:
+        """The batches that fit into a budget and what is free. Raises ShortOfMemoryError where none do.
+
+        kept: at most, in AMPLE bytes for each pixel of the grid. what: the scene, for the message.
+        """
+        free = free_bytes(self.device)
+        budget = self._budget(memory, free)
+        if AMPLE * kept * math.prod(grid.shape[1:]) <= budget:
+            return Batches(self.sources)
+        if free is not None and self._peak(Batches(self.sources)) > free:
             check_room(self._least, free, what)
+        return self._fitted(budget)
 
-    def fitted(self, memory: int, free: int | None) -> Batches:
-        """The batches that fit into a budget and what is free."""
-        return self._fitted(_budget(memory, free, self._device))
+    def _budget(self, memory: int, free: int | None) -> int:
+        """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""
+        budget = memory if free is None else max(1, min(memory, free))
+        return min(budget, CACHED) if self.device.type == "cpu" and not self.gradient else budget
 
     def _fitted(self, budget: int) -> Batches:
-        ways = {"gradient": self._gradient, "small_batches": self._small_batches}
-        return fitted(self.peak, self._sources, budget, **ways)
+        return fitted(self._peak, self.sources, budget, gradient=self.gradient, small_batches=self.small_batches)
 
     @property
     def _least(self) -> int:
-        return least_of(self.peak, self._sources, gradient=self._gradient, small_batches=self._small_batches)
+        return least_of(self._peak, self.sources, gradient=self.gradient, small_batches=self.small_batches)
 
-    def peak(self, batches: Batches) -> int:
-        """The most bytes that the scene holds at once."""
-        count, several = batches.sources, batches.sources < self._sources
-        one = self._course(1 + several, Batches(1, batches.slabs))
-        if count == 1:
-            held = most(one)
-        else:
-            held = extrapolated(one, self._course(2 * (1 + several), Batches(2, batches.slabs)), count)
-        if self._apart and several:
-            further = most(self._course(3, Batches(1))) - most(self._course(2, Batches(1)))
-            held += further * (self._sources - 2 * count)
-        return math.ceil(self._scale * held)
-
-    def _course(self, sources: int, batches: Batches) -> Course:
-        if (sources, batches) not in self._courses:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the scene itself will warn
-                with torch.set_grad_enabled(self._gradient):
-                    self._courses[sources, batches] = course_of(lambda: self._run(sources, batches))
-        return self._courses[sources, batches]
+    def _peak(self, batches: Batches) -> int:
+        kind = self.kind, self.gradient, torch.is_grad_enabled(), self.device.type
+        if kind not in _measured:
+            _measured[kind] = self.make()
+            if len(_measured) > KEPT:
+                _measured.popitem(last=False)
+        _measured.move_to_end(kind)
+        return _measured[kind].peak(batches)
 
 
-def _remembered(key: Hashable, make: Callable[[], _Sample]) -> _Sample:
-    """The sample of a kind of scene, made where there is none yet."""
-    if key not in _measured:
-        _measured[key] = make()
-        if len(_measured) > KEPT:
-            _measured.popitem(last=False)
-    _measured.move_to_end(key)
-    return _measured[key]
-
-
-def _sample_of(
+def _room_for(
     volume: Volume,
     microscope: Microscope,
     acquisition: Acquisition,
@@ -209,155 +161,23 @@ def _sample_of(
     levels: int,
     *,
     learned: bool = False,
-) -> _Sample:
-    """The sample of a volume's scene; learned: whether Δn is, whatever the volume says."""
-    learned = learned or volume.delta.requires_grad
+) -> _Room:
+    """The room of a volume's scene; learned: whether a gradient to Δn is wanted, whatever the volume says."""
     propagation = propagation_of(fidelity)
-    filled = _filled(volume) if propagation.holds_by_content else None
-    # the budget plays a part in the map of an object aberration, which is crowded by itself or not
+    wanted = learned or volume.delta.requires_grad
+    # the budget plays a part in the map of an object aberration, whose steps are computed again or not
     plain = fidelity if fidelity.object_aberration is not None else replace(fidelity, memory=1)
-    parts = volume.grid, volume.delta.dtype, volume.absorption, volume.background, microscope, acquisition
-    key = signature(parts), plain, levels, filled, learned, torch.is_grad_enabled(), volume.delta.device.type
+    filled = _filled(volume) if propagation.holds_by_content else None
+    parts = volume.delta.dtype, volume.absorption, volume.background, microscope, acquisition
+    sources = len(microscope.sources(fidelity.sources)[1])
 
-    def make() -> _Sample:
-        sample = _VolumeSample(volume, microscope, acquisition, fidelity, levels, learned=learned)
-        sources, device = len(microscope.sources(fidelity.sources)[1]), volume.delta.device
-        return _Sample(sample.run, sources, sample.scale, device, small_batches=propagation.small_batches)
+    def make() -> Sample:
+        sample = VolumeSample(volume, microscope, acquisition, fidelity, levels, learned=wanted)
+        return Sample(sample.run, sources, sample.scale)
 
-    return _remembered(key, make)
-
-
-def _sample_of_fields(passage: FieldPassage) -> _Sample:
-    """The sample of fields that are there already."""
-    parts = passage.grid, passage.transmission, passage.background, passage.microscope, passage.acquisition
-    plain, device = replace(passage.fidelity, memory=1), passage.transmission.device
-    key = signature(parts), plain, torch.is_grad_enabled(), device.type
-
-    def make() -> _Sample:
-        sources = len(passage.microscope.sources(passage.fidelity.sources)[1])
-        run, scale = _field_run(passage)
-        return _Sample(run, sources, scale, device, apart=passage.transmission.ndim == 3)
-
-    return _remembered(key, make)
-
-
-class _VolumeSample:
-    """A volume's scene on few pixels; scale: pixels of the scene to one of the sample, padding included."""
-
-    def __init__(
-        self,
-        volume: Volume,
-        microscope: Microscope,
-        acquisition: Acquisition,
-        fidelity: Fidelity,
-        levels: int,
-        *,
-        learned: bool,
-    ) -> None:
-        pad = fidelity.padding
-        whole = volume.grid.widened(pad, pad)
-        sides, padding = _few_pixels(volume.grid, pad, microscope)
-        self._grid = replace(volume.grid, shape=(volume.grid.shape[0], *sides))
-        self.scale = math.prod(whole.shape[1:]) / math.prod(self._grid.widened(padding, padding).shape[1:])
-        memory = max(1, int(fidelity.memory / self.scale))
-        self._fidelity = replace(fidelity, padding=padding, memory=memory)
-        self._microscope, self._acquisition = stand_in(replace(microscope, camera=None)), stand_in(acquisition)
-        self._levels, self._background = max(levels, 2), stand_in(volume.background)
-        # the content is as far apart as in the volume, relative to the sides, and its slopes are as steep
-        gentle = min(sides[0] / volume.grid.shape[1], sides[1] / volume.grid.shape[2])
-        self._delta = gentle * _pooled(volume.delta, sides)
-        self._absorption = None if volume.absorption is None else _pooled(volume.absorption, sides)
-        self._learned = [
-            learned,
-            volume.absorption is not None and volume.absorption.requires_grad,
-        ]
-
-    def run(self, sources: int, batches: Batches) -> None:
-        """Compute the sample. Where its content does not let light through, it is computed without any."""
-        try:
-            self._compute(sources, batches, self._delta)
-        except ValueError:
-            self._compute(sources, batches, torch.zeros_like(self._delta))
-
-    def _compute(self, sources: int, batches: Batches, delta: Tensor) -> None:
-        delta = delta.detach().requires_grad_(self._learned[0])
-        absorption = self._absorption
-        if absorption is not None:
-            absorption = absorption.detach().requires_grad_(self._learned[1])
-        volume = Volume(self._grid, delta, self._background, absorption)
-        microscope = _lit_by(self._microscope, sources, self._fidelity)
-        passage = Passage.through(volume, microscope, self._acquisition, self._fidelity, self._levels)
-        images = passage.images(batches)
-        if images.requires_grad:
-            images.sum().backward()
-
-
-def _field_run(passage: FieldPassage) -> tuple[Run, float]:
-    """What computes fields on few pixels, and how many of the scene's pixels one of theirs stands for."""
-    fidelity, pad = passage.fidelity, passage.fidelity.padding
-    (ny, nx), padding = _few_pixels(passage.grid, pad, passage.microscope)
-    whole = passage.grid.widened(pad, pad)
-    grid = Grid((1, ny, nx), passage.grid.spacing)
-    scale = math.prod(whole.shape[1:]) / math.prod(grid.widened(padding, padding).shape[1:])
-    own = passage.transmission
-    few = own.detach()[..., :ny, :nx].cpu()
-    background = stand_in(passage.background)
-    microscope, acquisition = stand_in(replace(passage.microscope, camera=None)), stand_in(passage.acquisition)
-
-    def run(sources: int, batches: Batches) -> None:
-        field = few if few.ndim == 2 else few[torch.arange(sources) % len(few)]
-        field = field.clone().requires_grad_(own.requires_grad)
-        lit = _lit_by(microscope, sources, fidelity)
-        sample = FieldPassage(field, grid, background, lit, acquisition, replace(fidelity, padding=padding))
-        images = sample.images(batches)
-        if images.requires_grad:
-            images.sum().backward()
-
-    return run, scale
-
-
-def _lit_by(microscope: Microscope, sources: int, fidelity: Fidelity) -> Microscope:
-    """A microscope with so many of its sources, one after the other and again from the first."""
-    points, _ = microscope.sources(fidelity.sources, dtype=torch.float64)
-    return microscope.lit_from(points[torch.arange(sources) % len(points)])
-
-
-def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple[int, int], int]:
-    """The sample's sides (y, x) without padding, and its padding.
-
-    Of the sizes that serve, the one in which a pupil's window and the coarser array for the intensities take about the
-    same parts of the pixels as in the scene.
-    """
-    whole = grid.widened(padding, padding)
-    wavelength = min(part.wavelength for part, _ in microscope.colours())
-    aimed = _parts(whole, wavelength, microscope)
-    best = None
-    for side in SIDES:
-        share = min(1.0, side / min(whole.shape[1:]))
-        pad = math.ceil(padding * share)
-        sides = tuple(min(n, max(1, math.ceil(share * (n + 2 * padding)) - 2 * pad)) for n in grid.shape[1:])
-        sides = (min(sides[0], side), min(sides[1], side))
-        few = replace(grid, shape=(grid.shape[0], *sides)).widened(pad, pad)
-        differs = sum(abs(a - b) for a, b in zip(_parts(few, wavelength, microscope), aimed, strict=True))
-        if best is None or differs < best[0]:
-            best = differs, sides, pad
-    assert best is not None
-    return best[1], best[2]
-
-
-def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float, float]:
-    """The parts of the array's pixels that a pupil's window and the array for the intensities have."""
-    objective = microscope.objective
-    found = None if objective is None else passband.sizes(grid, wavelength, objective.na)
-    if found is None:
-        return 1.0, 1.0
-    window, array = (math.prod(shape) / math.prod(grid.shape[1:]) for shape in found)
-    return window, array
-
-
-def _pooled(field: Tensor, sides: tuple[int, int]) -> Tensor:
-    """A field's means over blocks of pixels, on the CPU; the field itself where it has no more pixels."""
-    return F.adaptive_avg_pool2d(field.detach().cpu()[None], sides)[0]
+    kind = volume.grid, signature(parts), wanted, plain, levels, filled
+    gradient = torch.is_grad_enabled() and (wanted or is_learned(parts))
+    return _Room(kind, make, sources, volume.delta.device, gradient, propagation.small_batches)
 
 
 def _filled(volume: Volume) -> int:

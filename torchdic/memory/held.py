@@ -101,30 +101,34 @@ def extrapolated(one: Course, two: Course, count: int) -> int:
 def aligned(one: Course, two: Course) -> Iterator[tuple[int, int]]:
     """The bytes after each allocation of one run beside those after the same one of a run that may make more.
 
-    Where the operations differ, the second run goes on with what the first one does not make, until they agree again.
+    Where the operations differ, allocations of the second run are skipped until both agree again; where they do not
+    agree again, the first run's allocation is.
     """
     if len(one) == len(two):
         yield from ((a.held, b.held) for a, b in zip(one, two, strict=True))
         return
+    first, second = ([allocation.operation for allocation in course] for course in (one, two))
+    most_skipped = max(len(two) - len(one), 0) + ALIKE
     j = 0
-    for i, allocation in enumerate(one):
-        if j < len(two) and two[j].operation != allocation.operation:
-            ahead = [a.operation for a in one[i : i + ALIKE]]
-            following = (k for k in range(j, len(two)) if [a.operation for a in two[k : k + ALIKE]] == ahead)
-            j = next(following, len(two))
+    for i, operation in enumerate(first):
         if j >= len(two):
             return
-        yield allocation.held, two[j].held
+        if second[j] != operation:
+            ahead = first[i : i + ALIKE]
+            following = (k for k in range(j, j + most_skipped) if second[k : k + ALIKE] == ahead)
+            found = next(following, None)
+            if found is None:
+                continue
+            j = found
+        yield one[i].held, two[j].held
         j += 1
 
 
 def crowded(step: Callable[[], object], steps: int, budget: int) -> bool:
     """Whether that many steps keep more than a budget in bytes for the backward pass, by what the first one keeps.
 
-    step: runs the first step and returns its result. Nothing is run where no gradient is wanted.
+    step: runs the first step and returns its result.
     """
-    if not torch.is_grad_enabled():
-        return False
     with Held() as held:
         result = step()
     kept = held.bytes  # the result holds its graph, and the graph what it saved

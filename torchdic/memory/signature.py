@@ -4,6 +4,7 @@ from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import TypeVar
 
+import torch
 from torch import Tensor
 
 T = TypeVar("T")
@@ -25,6 +26,19 @@ def signature(part: object) -> Hashable:
         return type(part).__name__, tuple(signature(getattr(part, field.name)) for field in fields(part))
     assert isinstance(part, Hashable)
     return part
+
+
+def is_learned(part: object) -> bool:
+    """Whether a gradient is wanted to a tensor anywhere in a dataclass, sequence or mapping."""
+    if isinstance(part, Tensor):
+        return part.requires_grad and torch.is_grad_enabled()
+    if isinstance(part, Mapping):
+        return any(map(is_learned, part.values()))
+    if isinstance(part, list | tuple):
+        return any(map(is_learned, part))
+    if is_dataclass(part):
+        return any(is_learned(getattr(part, field.name)) for field in fields(part))
+    return False
 
 
 def stand_in(part: T) -> T:

@@ -32,6 +32,7 @@ from torchdic.grid import Grid
 from torchdic.memory.batches import recompute
 from torchdic.memory.batches import slabs as ranges
 from torchdic.memory.held import crowded
+from torchdic.memory.signature import is_learned
 from torchdic.plane_waves import axial_momentum
 from torchdic.rays.equation import MOVING, RayEquation
 from torchdic.rays.solver import solve
@@ -166,6 +167,11 @@ class Flight:
         self._depths = self._start + (face - self._start) * edges / max(self.steps, 1)
         self._depths[-1] = face
 
+    @property
+    def learned(self) -> bool:
+        """Whether there are several steps, and a gradient through them is wanted."""
+        return self.steps > 1 and is_learned((self.straight, self.volume.background, self.volume.fields))
+
     def beginning(self) -> Float[Tensor, "component *ray"]:
         """The state of rays that do not deviate yet."""
         components = MOVING + len(self.volume.fields) + self._turn
@@ -222,7 +228,7 @@ def fly(flight: Flight, budget: int, slabs: bool | None = None) -> Float[Tensor,
     """
     state = flight.beginning()
     if slabs is None:
-        slabs = flight.steps > 1 and crowded(lambda: flight.cross(0, 1, state), flight.steps, budget)
+        slabs = flight.learned and crowded(lambda: flight.cross(0, 1, state), flight.steps, budget)
     for first, last in ranges(flight.steps, split=slabs and flight.equal_steps):
         state = recompute(flight.cross, first, last, state, when=slabs)
     return state
