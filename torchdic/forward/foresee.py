@@ -1,10 +1,11 @@
-"""Memory foreseen: what an image will hold at once, measured on a sample of the scene before it is computed.
+"""The memory that an image will hold at once, measured on a sample of the scene before the image is computed.
 
-The sample is the scene itself, with all of its slices, prisms and focus planes, but on few pixels and lit by one source
-or two. It is run, with its gradient where one is wanted, while the bytes that it holds are counted
-(`torchdic.memory.held`). Its pixels and sources are then scaled to the scene's: bytes grow in proportion to the pixels,
-and linearly with the sources of a batch. What a sample holds hangs on the scene's shapes and not on its values, so each
-kind of scene is measured once.
+The sample is the scene itself, with all of its slices, prisms and focus planes, but with few pixels and one or two
+sources. It is run, with its gradient if one is wanted, and the bytes that it holds are counted
+(`torchdic.memory.held`). They are then scaled to the scene: bytes grow in proportion to the pixels, and linearly with
+the sources of a batch. The memory of a sample depends on the scene's shapes and not on its values, so each kind of
+scene is measured once. Rays are an exception: their memory also depends on how much of the array is empty, so that this
+is part of the kind.
 """
 
 import math
@@ -30,17 +31,17 @@ from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
 from torchdic.specimen.volume import Volume
 
-# Pixels along a side of the sample: about so many, and as many as the scene has where those are fewer.
+# Pixels along a side of the sample: a number in this range, or all pixels of the scene if it has fewer.
 SIDES = range(36, 53)
-# Bytes that a batch on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches, up to 1.4
-# times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
+# Bytes that a batch on the CPU may hold if no gradient is wanted. Its arrays then stay in the caches, which is up to
+# 1.4 times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
-# More bytes than any scene holds for each source and pixel, and for each slice and image where a gradient is wanted. A
-# scene that fits into its budget even so is computed at once and not measured.
+# More bytes than any scene holds for each source and pixel. With a gradient they count for each slice and image. If a
+# scene fits into its budget even by this number, it is computed at once and not measured.
 AMPLE = 2048
-# The same for the map of an object aberration, which serves all sources: as many times AMPLE for each slice.
+# The map of an object aberration serves all sources: it holds less than this many times AMPLE for each slice.
 MAP = 40
-# Kinds of scenes whose measurements are kept.
+# Number of kinds of scenes whose measurements are kept.
 KEPT = 32
 _measured: "OrderedDict[Hashable, _Sample]" = OrderedDict()
 
@@ -53,10 +54,12 @@ def foreseen(
     *,
     gradient: bool | None = None,
 ) -> Foreseen:
-    """What `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
+    """The memory that `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
 
-    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad. An
-    object_aberration of the fidelity is found, because the memory depends on how strong it is.
+    volume, microscope, acquisition, fidelity: as for `image`.
+    gradient: whether a gradient is wanted, at least with respect to the volume. None decides as `image` does, by which
+        tensors require grad.
+    If the fidelity names an object_aberration, its map is computed, because the memory depends on how strong it is.
     """
     levels = 0
     if fidelity.object_aberration is not None:
@@ -70,10 +73,10 @@ def foreseen(
 def allot(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int | None = None
 ) -> Batches:
-    """The batches in which `image` computes within its budget and what is free.
+    """The batches in which `image` stays within its budget and within the free memory.
 
-    levels: of an object aberration; None where it isn't known yet. Raises ShortOfMemoryError where even single sources,
-    their steps computed again, want more than is free.
+    levels: number of levels of an object aberration; None if it isn't known yet.
+    Raises ShortOfMemoryError if even single sources, whose steps are computed again, need more memory than is free.
     """
     grid, device = volume.grid.widened(fidelity.padding, fidelity.padding), volume.delta.device
     slices, images = grid.shape[0], len(acquisition.prisms) * len(acquisition.focus)
@@ -94,7 +97,7 @@ def allot(
 
 
 def allot_fields(passage: FieldPassage) -> Batches:
-    """As `allot`, for the images of fields that are there already."""
+    """Like `allot`, for the images of given fields."""
     fidelity, acquisition, device = passage.fidelity, passage.acquisition, passage.transmission.device
     grid = passage.grid.widened(fidelity.padding, fidelity.padding)
     prisms, planes = len(acquisition.prisms), len(acquisition.focus)
@@ -109,27 +112,31 @@ def allot_fields(passage: FieldPassage) -> Batches:
 
 
 def _ample(kept: int, grid: Grid, fidelity: Fidelity, device: torch.device, free: int | None) -> bool:
-    """Whether all sources fit into the budget at once, whatever is done with them; kept: see AMPLE."""
+    """Whether all sources fit into the budget at once by the number AMPLE. kept: what AMPLE counts for each pixel."""
     return AMPLE * kept * math.prod(grid.shape[1:]) <= _budget(fidelity.memory, free, device)
 
 
 def _budget(memory: int, free: int | None, device: torch.device) -> int:
-    """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""
+    """Bytes that an image may hold: within `memory`, what is free, and the caches (on the CPU without a gradient)."""
     budget = memory if free is None else max(1, min(memory, free))
     return min(budget, CACHED) if device.type == "cpu" and not torch.is_grad_enabled() else budget
 
 
 # --- the sample ------------------------------------------------------------------------------------------------------
 
-# Runs a sample of so many sources in batches, and its gradient if one is wanted.
+# Runs a sample with this many sources in batches, and its gradient if one is wanted.
 Run = Callable[[int, Batches], None]
 
 
 class _Sample:
-    """A scene's sample, and what it was found to hold.
+    """A scene's sample, and the memory that it was found to hold.
 
-    run: computes the sample. sources: of the scene. scale: pixels of the scene to one of the sample. apart: whether
-    every source has a field of its own, which is held beside the batches.
+    run: computes the sample.
+    sources: number of sources of the scene.
+    scale: pixels of the scene for each pixel of the sample.
+    device: of the scene.
+    small_batches: see `ways`.
+    apart: whether every source has a field of its own, which is held beside the batches.
     """
 
     def __init__(
@@ -148,17 +155,17 @@ class _Sample:
         self._courses: dict[tuple[int, Batches], Course] = {}
 
     def foreseen(self, memory: int) -> Foreseen:
-        """What the scene holds within a budget in bytes."""
+        """The memory that the scene holds within a budget in bytes."""
         batches = self._fitted(_budget(memory, None, self._device))
         return Foreseen(self.peak(batches), self._least, batches.sources, batches.slabs)
 
     def check_room(self, free: int | None, what: str) -> None:
-        """Raise ShortOfMemoryError where the scene can't be computed in what is free."""
+        """Raise ShortOfMemoryError if the scene can't be computed in the free memory."""
         if free is not None and self.peak(Batches(self._sources)) > free:
             check_room(self._least, free, what)
 
     def fitted(self, memory: int, free: int | None) -> Batches:
-        """The batches that fit into a budget and what is free."""
+        """The batches that fit into a budget in bytes and into the free memory."""
         return self._fitted(_budget(memory, free, self._device))
 
     def _fitted(self, budget: int) -> Batches:
@@ -170,7 +177,7 @@ class _Sample:
         return least_of(self.peak, self._sources, gradient=self._gradient, small_batches=self._small_batches)
 
     def peak(self, batches: Batches) -> int:
-        """The most bytes that the scene holds at once."""
+        """The largest number of bytes that the scene holds at once in these batches."""
         count, several = batches.sources, batches.sources < self._sources
         one = self._course(1 + several, Batches(1, batches.slabs))
         if count == 1:
@@ -192,7 +199,7 @@ class _Sample:
 
 
 def _remembered(key: Hashable, make: Callable[[], _Sample]) -> _Sample:
-    """The sample of a kind of scene, made where there is none yet."""
+    """The sample of a kind of scene. It is made if there is none yet."""
     if key not in _measured:
         _measured[key] = make()
         if len(_measured) > KEPT:
@@ -210,11 +217,11 @@ def _sample_of(
     *,
     learned: bool = False,
 ) -> _Sample:
-    """The sample of a volume's scene; learned: whether Δn is, whatever the volume says."""
+    """The sample of a volume's scene. learned: True counts Δn as learned even if it doesn't require grad."""
     learned = learned or volume.delta.requires_grad
     propagation = propagation_of(fidelity)
     filled = _filled(volume) if propagation.holds_by_content else None
-    # the budget plays a part in the map of an object aberration, which is crowded by itself or not
+    # the budget matters only to the map of an object aberration, which may exceed it by itself
     plain = fidelity if fidelity.object_aberration is not None else replace(fidelity, memory=1)
     parts = volume.grid, volume.delta.dtype, volume.absorption, volume.background, microscope, acquisition
     key = signature(parts), plain, levels, filled, learned, torch.is_grad_enabled(), volume.delta.device.type
@@ -228,7 +235,7 @@ def _sample_of(
 
 
 def _sample_of_fields(passage: FieldPassage) -> _Sample:
-    """The sample of fields that are there already."""
+    """The sample of a scene of given fields."""
     parts = passage.grid, passage.transmission, passage.background, passage.microscope, passage.acquisition
     plain, device = replace(passage.fidelity, memory=1), passage.transmission.device
     key = signature(parts), plain, torch.is_grad_enabled(), device.type
@@ -242,7 +249,7 @@ def _sample_of_fields(passage: FieldPassage) -> _Sample:
 
 
 class _VolumeSample:
-    """A volume's scene on few pixels; scale: pixels of the scene to one of the sample, padding included."""
+    """A volume's scene on few pixels. scale: pixels of the scene for each pixel of the sample, padding included."""
 
     def __init__(
         self,
@@ -263,7 +270,7 @@ class _VolumeSample:
         self._fidelity = replace(fidelity, padding=padding, memory=memory)
         self._microscope, self._acquisition = stand_in(replace(microscope, camera=None)), stand_in(acquisition)
         self._levels, self._background = max(levels, 2), stand_in(volume.background)
-        # the content is as far apart as in the volume, relative to the sides, and its slopes are as steep
+        # pooling brings the content closer together, so Δn is lowered to keep its slopes as steep as in the volume
         gentle = min(sides[0] / volume.grid.shape[1], sides[1] / volume.grid.shape[2])
         self._delta = gentle * _pooled(volume.delta, sides)
         self._absorption = None if volume.absorption is None else _pooled(volume.absorption, sides)
@@ -273,7 +280,7 @@ class _VolumeSample:
         ]
 
     def run(self, sources: int, batches: Batches) -> None:
-        """Compute the sample. Where its content does not let light through, it is computed without any."""
+        """Compute the sample. If light can't cross its content, compute it without content."""
         try:
             self._compute(sources, batches, self._delta)
         except ValueError:
@@ -293,7 +300,7 @@ class _VolumeSample:
 
 
 def _field_run(passage: FieldPassage) -> tuple[Run, float]:
-    """What computes fields on few pixels, and how many of the scene's pixels one of theirs stands for."""
+    """A function that computes fields on few pixels, and the scene's pixels for each of these."""
     fidelity, pad = passage.fidelity, passage.fidelity.padding
     (ny, nx), padding = _few_pixels(passage.grid, pad, passage.microscope)
     whole = passage.grid.widened(pad, pad)
@@ -317,16 +324,16 @@ def _field_run(passage: FieldPassage) -> tuple[Run, float]:
 
 
 def _lit_by(microscope: Microscope, sources: int, fidelity: Fidelity) -> Microscope:
-    """A microscope with so many of its sources, one after the other and again from the first."""
+    """The microscope lit by this many of its sources. If it has fewer, they are repeated."""
     points, _ = microscope.sources(fidelity.sources, dtype=torch.float64)
     return microscope.lit_from(points[torch.arange(sources) % len(points)])
 
 
 def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple[int, int], int]:
-    """The sample's sides (y, x) without padding, and its padding.
+    """The sample's sides (y, x) without padding, and its padding, in pixels.
 
-    Of the sizes that serve, the one in which a pupil's window and the coarser array for the intensities take about the
-    same parts of the pixels as in the scene.
+    Of the sizes in SIDES this is the one in which the pupil's window, and the coarser array for the intensities, take
+    about the same parts of the pixels as in the scene.
     """
     whole = grid.widened(padding, padding)
     wavelength = min(part.wavelength for part, _ in microscope.colours())
@@ -346,7 +353,7 @@ def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple
 
 
 def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float, float]:
-    """The parts of the array's pixels that a pupil's window and the array for the intensities have."""
+    """The parts of the array's pixels that the pupil's window and the coarser array for the intensities take."""
     objective = microscope.objective
     found = None if objective is None else passband.sizes(grid, wavelength, objective.na)
     if found is None:
@@ -356,11 +363,11 @@ def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float
 
 
 def _pooled(field: Tensor, sides: tuple[int, int]) -> Tensor:
-    """A field's means over blocks of pixels, on the CPU; the field itself where it has no more pixels."""
+    """Means of a field over blocks of pixels, on the CPU. A field with no more pixels than `sides` is unchanged."""
     return F.adaptive_avg_pool2d(field.detach().cpu()[None], sides)[0]
 
 
 def _filled(volume: Volume) -> int:
-    """Eighths of the array's pixels in which there is something."""
+    """How many eighths of the array's pixels have a Δn in any slice."""
     there = (volume.delta.detach() != 0).any(0)
     return round(8 * float(there.sum()) / there.numel())
