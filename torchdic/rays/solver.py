@@ -185,7 +185,7 @@ class _Evaluation(torch.autograd.Function):
 
 
 class _Gradients:
-    """The loss's derivatives in an equation's tensors, summed over its evaluations; None where nobody asks."""
+    """The loss's derivatives by an equation's tensors, summed over its evaluations; None for a tensor not learned."""
 
     def __init__(self, equation: RayEquation) -> None:
         self.bars = [torch.zeros_like(t) if t.requires_grad else None for t in equation.tensors]
@@ -227,9 +227,10 @@ def _advanced(moving: Tensor, slopes: Sequence[Tensor], row: Sequence[float], h:
 
 
 def _maker(equation: RayEquation) -> Callable[[Sequence[Tensor]], tuple[RayEquation, list[Tensor]]]:
-    """What makes the equation anew of its tensors as autograd hands them back, and tells what comes behind them.
+    """A function that makes the equation again from its tensors, as autograd returns them.
 
-    It holds no tensor itself: those of a solution that is computed again would be held until then.
+    It also returns the tensors that follow those of the equation. It holds no tensor itself. Otherwise the tensors of a
+    solution that is computed again would be held until then.
     """
     index, face, turn = equation.index, equation.face, equation.turn
     grid, interpolation, first = index.grid, index.interpolation, index.first
