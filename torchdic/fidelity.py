@@ -35,8 +35,8 @@ class Fidelity:
     sources: largest number of condenser directions, if the condenser names no points of its own. K rings of 2K
         directions serve best (8, 18, 32, 50, 72, 98, 128, 200). Other numbers may not light the specimen alike from
         opposite sides, and the bright field of a weak phase is sensitive to that.
-    interpolation: of the index between voxel centres, for rays: "linear" or "cubic" (C² spline). The wave uses the
-        voxels as they are.
+    interpolation: of the index between voxel centres: "linear" or "cubic" (C² spline). The wave ignores it and uses
+        the voxels as they are.
     solver: torchdiffeq's method for the ray ODE. The methods bosh3, dopri5 and dopri8 adapt their steps: they keep the
         error of every single ray within `tolerance` and ignore `steps`.
     tolerance: largest local error of an adaptive solver, both absolute in µm and relative.
