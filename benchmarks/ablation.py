@@ -2,12 +2,13 @@
 
     python benchmarks/ablation.py
 
-A row for the method and for the method with one part changed; the error is the rms difference from the exact image
-over that image's standard deviation, at each focus plane. The model is run on the reference's periodic array.
+There is a row for each method, and one for the method with a single part changed. The error is the rms difference from
+the exact image over that image's standard deviation, at each focus plane. The model runs on the reference's periodic
+array.
 
-A second table is of the specimen's own defocus of each object point, Kagalwala & Kanade's Eq. 6, on the smooth ball and
-on the sharp bead of tests/data/exact_sphere_dic.npz, unpadded: what it gives to rays without amplitude, straight and
-bent, and what it does to those that carry theirs, which `Fidelity` refuses.
+Further tables show the specimen's own defocus of each object point, Kagalwala & Kanade's Eq. 6, on the smooth ball and
+on the sharp bead of tests/data/exact_sphere_dic.npz, without padding. They show what it gains for straight and bent
+rays without amplitude. They also show what it does to rays with amplitude, a combination that `Fidelity` refuses.
 """
 
 import math
@@ -71,7 +72,7 @@ def textbook_screen(volume: Volume, wavelength: float, momentum: Tensor, steps: 
 
 
 def textbook_images(volume: Volume, scene: Scene, padding: int, steps: int) -> Tensor:
-    """Images of the textbook's split step: its field, taken back to z = 0 in the background, as a transmission."""
+    """Images of the textbook's split step. Its field is taken back to z = 0 in the background, as a transmission."""
     grid = replace(volume.grid, shape=(volume.grid.shape[0], *(n + 2 * padding for n in volume.grid.shape[1:])))
     wide = Volume(grid, torch.nn.functional.pad(volume.delta, (padding,) * 4), volume.background)
     momentum, _ = scene.microscope.sources(Fidelity("wave").sources, dtype=wide.delta.dtype, device=wide.delta.device)
@@ -84,7 +85,7 @@ def textbook_images(volume: Volume, scene: Scene, padding: int, steps: int) -> T
 
 
 def ablation(name: Name, scene: Scene, slices: int, rays: Fidelity, padding: int) -> list[float]:
-    """Errors at each focus plane; `rays` is how the ray rows trace, `slices` how finely the volume is cut."""
+    """Errors at each focus plane. rays: how the ray rows are traced. slices: into how many the volume is cut."""
     volume = scene.volume(slices)
     trials: dict[Name, Callable[[], Tensor]] = {
         "rays": lambda: image(volume, scene.microscope, scene.acquisition, rays),
@@ -101,9 +102,9 @@ def ablation(name: Name, scene: Scene, slices: int, rays: Fidelity, padding: int
 
 
 def own_defocus(scene: Scene, slices: int, rays: Fidelity, method: AberrationMethod, times: float = 1.0) -> list[float]:
-    """Errors of a field of rays, of whatever amplitude, whose points spread with `times` their own defocus.
+    """Errors of a field of rays whose points spread with `times` their own defocus.
 
-    It puts together what `image` does, and what it refuses: rays with amplitude, which have the defocus already.
+    It does what `image` does, and also what `image` refuses: rays with amplitude, which have the defocus already.
     """
     volume, microscope = scene.volume(slices), scene.microscope
     assert microscope.condenser is not None

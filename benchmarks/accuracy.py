@@ -3,8 +3,8 @@
     python benchmarks/accuracy.py [--out docs] [--scenes NAME ...] [--repeats 3]
 
 Objective NA 0.9, condenser NA 0.7, 546 nm, shear 0.24 µm along x, bias π/2, float32 unless a candidate says otherwise.
-The truth is an exact field where there is one, otherwise the converged wave. Errors are defined in
-`torchdic.planning.work_precision`; its ladder of candidates is tried, and the presets.
+The truth is an exact field if there is one, otherwise the converged wave. Errors are defined in
+`torchdic.planning.work_precision`. The candidates are those of its ladder, and the presets.
 """
 
 import argparse
@@ -44,9 +44,9 @@ PRESETS = {"DRAFT": DRAFT, "STANDARD": STANDARD, "REFERENCE": REFERENCE}
 
 @dataclass(frozen=True)
 class Scene:
-    """A specimen (None is an empty volume) in a medium, its voxels, and focus planes in µm.
+    """A specimen in a medium, its voxels, and focus planes in µm. A specimen of None is an empty volume.
 
-    finest: slabs to the slice in the converged wave.
+    finest: slabs per slice in the converged wave.
     """
 
     specimen: Specimen | None
@@ -88,7 +88,7 @@ def candidates(grid: Grid) -> list[Candidate]:
 
 def measure(scene: Scene, repeats: int, tried: list[Candidate]) -> Iterator[Trial]:
     """Trials of the candidates on a scene, one by one."""
-    # rays and float32 are held short: their converged answers err by far less than the trials
+    # few steps for rays, and float32: even so the converged answers err by far less than the trials
     slices, margin = scene.grid.shape[0], REFERENCE.padding
     references: dict[str, Fidelity] = {
         "projection": Fidelity("projection", sources=200, padding=margin),

@@ -1,4 +1,4 @@
-"""Trials of the model against images of known answer, as the rows of a Markdown table."""
+"""Trials of the model against images with a known answer, as the rows of a Markdown table."""
 
 import time
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from torchdic import Acquisition, Fidelity, Microscope, Volume, image
 
 
 def contrast_errors(images: Tensor, exact: Tensor) -> list[float]:
-    """Rms difference over the exact image's standard deviation, at each focus plane that of the worst prism."""
+    """The rms difference over the exact image's standard deviation, at each focus plane, for the worst prism."""
     return ((images - exact).square().mean((2, 3)).sqrt() / exact.std((2, 3), correction=0)).amax(0).tolist()
 
 

@@ -2,10 +2,11 @@
 
     python benchmarks/exact_fields.py
 
-The fields are partial waves (data_synthetic), so that none of our propagations has a part in the answer. Exact and
-model images share their 13 condenser directions and their periodic array, twice as wide as what is compared: neither
-the quadrature nor what wraps around takes part in the error, which is the rms difference over the exact image's
-standard deviation; nan where rays turn back. Objective NA 0.9, 546 nm, shear 0.2 µm along x, bias π/2, float32.
+The fields are sums of partial waves (data_synthetic), so none of our propagations takes part in the answer. The exact
+images and the model's have the same 13 condenser directions and the same periodic array, twice as wide as the part that
+is compared. So neither the choice of directions nor the light that wraps around adds to the error. The error is the rms
+difference over the exact image's standard deviation, or nan if rays turn back. Objective NA 0.9, 546 nm, shear 0.2 µm
+along x, bias π/2, float32.
 """
 
 import math
@@ -48,7 +49,7 @@ class Case:
 
     @property
     def padding(self) -> int:
-        """Voxels a side that make the model's array the exact one's."""
+        """Voxels on each side that make the model's array as wide as the exact one."""
         return round(WIDENING * self.grid.shape[1])
 
 
@@ -98,7 +99,7 @@ def exact(case: Case, na: float) -> Float[Tensor, "prism focus y x"]:
 
 
 def errors(case: Case, na: float, propagation: str, steps: int, expected: Tensor) -> tuple[list[float], float]:
-    """Errors of a propagation in so many equal steps through the whole depth, and its seconds."""
+    """Errors of a propagation in that many equal steps through the whole depth, and its seconds."""
     fidelity = Fidelity(propagation, steps=steps, padding=case.padding)
     return trial(case.volume(), microscope(na), case.acquisition, fidelity, expected)
 

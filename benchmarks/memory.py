@@ -1,10 +1,10 @@
-"""Memory foreseen beside what is measured.
+"""Foreseen memory beside measured memory.
 
     python benchmarks/memory.py [--small]
 
-Each scene with its gradient and without, float32: what `torchdic.foreseen` says before the run, the most bytes of
-tensors that the run holds at once beyond the volume, as torch's allocator tells the profiler, and into what batches the
-budget makes it go. --small: an eighth of the pixels, for those who changed a kernel and look for the constants.
+Each scene is run with its gradient and without, in float32. A row shows what `torchdic.foreseen` says before the run,
+the most bytes of tensors that the run holds at once without the volume, as torch's allocator tells the profiler, and
+the batches that the budget leads to. --small: an eighth of the pixels, for a quick check after a change.
 """
 
 import argparse
@@ -74,7 +74,7 @@ def main() -> None:
 def measured(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, *, gradient: bool
 ) -> int:
-    """Most bytes held at once, of those that the run allocates."""
+    """The most bytes held at once of those that the run allocates."""
 
     def run() -> None:
         with torch.set_grad_enabled(gradient):

@@ -2,10 +2,11 @@
 
     python benchmarks/on_gpu.py [--voxels 256 1024 1024] [--steps 256] [--device cuda]
 
-A ray from each voxel of the first face. The bytes that must move, were every evaluation one fused kernel: of each ray,
-forward, δy, δx, δp_y, δp_x and W read and written and the three sampled values written; backward, the sampled values
-read and the five derivatives read and written; of the slices, two read in either pass and their derivatives read and
-written backward. Over the time, that is a bandwidth, here compared with that of a copy within the device.
+There is one ray from each voxel of the first face. The bytes that must move are counted as if every evaluation were one
+fused kernel. In the forward pass each ray's δy, δx, δp_y, δp_x and W are read and written, and its three sampled values
+are written. In the backward pass the sampled values are read, and the five derivatives are read and written. Two slices
+are read in either pass, and their derivatives are read and written in the backward one. These bytes over the time are a
+bandwidth, which is compared with that of a copy within the device.
 """
 
 import argparse
@@ -66,7 +67,7 @@ def main() -> None:
 
 
 def scene(shape: tuple[int, int, int], device: torch.device) -> tuple[Volume, Rays]:
-    """A smooth volume, learned, and a ray from each voxel of its first face."""
+    """A smooth, learned volume, and a ray from each voxel of its first face."""
     grid = Grid(shape, (0.1, 0.1, 0.1))
     z, y, x = (grid.coordinates(axis, dtype=torch.float32, device=device) for axis in range(3))
     delta = torch.sin(1.1 * z)[:, None, None] * torch.cos(0.9 * y)[:, None] * torch.sin(0.7 * x + 0.4)
@@ -86,7 +87,7 @@ def best(run: Callable, device: torch.device, repeats: int) -> tuple[float, str]
 
 
 def copy_bandwidth(device: torch.device) -> float:
-    """Bytes per second, read and written, of copying a large tensor."""
+    """Bytes per second, read and written, when a large tensor is copied."""
     source = torch.zeros((1 << 28) if device.type == "cuda" else (1 << 24), device=device)
     target = torch.empty_like(source)
     seconds, _ = best(lambda: target.copy_(source), device, 10)

@@ -1,10 +1,11 @@
-"""What planning gains, and what it costs itself.
+"""What planning gains, and what it costs.
 
     OMP_NUM_THREADS=1 python benchmarks/planner.py
 
-For scenes up the ladder, some of them drawn at random: the plan's choice, its predicted error and the realised one
-against the converged wave, process seconds of REFERENCE, of the plan's run (predicted too) and of planning, float32,
-the least of two. Planning may take a second, or a fifth of the run that it plans.
+The scenes run from simple to demanding, and some are drawn at random. For each the table shows the plan's choice, its
+predicted error, and the realised error against the converged wave. It also shows the process seconds of REFERENCE, of
+the plan's run (measured and predicted) and of planning, in float32, the least of two. Planning may take one second, or
+a fifth of the run that it plans.
 """
 
 import math
@@ -61,7 +62,10 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is planned; padding: how far the truth's sides are moved away, 0 where the specimen reaches them."""
+    """A scene to plan.
+
+    padding: how far the truth's sides are moved away; 0 if the specimen reaches them.
+    """
 
     volume: Volume
     tolerance: float = 0.03
@@ -80,7 +84,7 @@ def main() -> None:
 
 
 def scenes() -> dict[str, Scene]:
-    """From nothing at all to what asks for everything, then some drawn at random."""
+    """Scenes from an empty one to those that need everything, then some drawn at random."""
     y, x = (GRID.coordinates(axis) for axis in (1, 2))
     layered = 0.02 * torch.sin(GRID.coordinates(0))[:, None, None].expand(GRID.shape)
     rod = (0.02 * torch.exp(-(y[:, None] ** 2 + x**2) / 2 / 2.0**2)).expand(GRID.shape)
@@ -156,7 +160,7 @@ def _row(name: str, scene: Scene) -> None:
 
 
 def _timed(run: Callable[[], T]) -> tuple[T, float]:
-    """What it returns, and its process seconds, the least of two."""
+    """The function's result, and its process seconds, the least of two."""
 
     def once() -> tuple[T, float]:
         started = time.process_time()

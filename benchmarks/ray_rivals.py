@@ -1,12 +1,12 @@
-"""Ways to carry rays through a volume of index, all by the same RK4 steps; see rays.py, which times them.
+"""Ways to trace rays through a volume of index, all by the same RK4 steps. rays.py times them.
 
-Each way is a class: made from Δn (z, y, x) in float32, with `forward()` → how far rays landed from where they would
-have without the specimen (y, x; ray) and their OPD, and, where it can, `gradient()` → ∂/∂Δn of Σ OPD².
-All sample Δn and its central differences linearly between voxel centres, and start from every voxel's (y, x) on the
-first face in one direction.
+Each way is a class made from Δn (z, y, x) in float32. `forward()` returns how far rays landed from where they would
+have landed without the specimen (y, x; ray), and their OPD. If the way can do it, `gradient()` returns ∂/∂Δn of Σ OPD².
+All ways sample Δn and its central differences linearly between voxel centres. Rays start from every voxel's (y, x) on
+the first face in one direction.
 """
 
-# the rivals are an extra that a checkout can do without
+# the rivals are optional packages
 # pyright: reportMissingImports=false
 
 import math
@@ -29,7 +29,7 @@ def start(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Torchdic:
-    """torchdic.trace with everything kept that fits the default memory budget."""
+    """torchdic.trace, which keeps everything if it fits the default memory budget."""
 
     budget = 1 << 34
 
@@ -69,7 +69,7 @@ class Torchdic:
 
 
 class TorchdicRecomputing(Torchdic):
-    """The same where the budget is too small to keep a step: slabs are computed again in the backward pass."""
+    """Like Torchdic with a budget too small to keep a step: the backward pass computes slabs again."""
 
     budget = 1
 
@@ -208,7 +208,7 @@ class Diffrax:
             opd = (d * (2 * BACKGROUND + d) + dy * dy + dx * dx + q * q) / (2 * pz)
             return jnp.stack((py / pz, px / pz, n * gy / pz, n * gx / pz, opd))
 
-        # diffrax has no classical RK4; a tableau is all that it takes
+        # diffrax has no classical RK4, but takes a tableau
         rk4 = diffrax.ButcherTableau(
             a_lower=(np.array([1 / 2]), np.array([0, 1 / 2]), np.array([0, 0, 1.0])),
             b_sol=np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6]),
@@ -248,7 +248,7 @@ class Diffrax:
 
 
 class Numba:
-    """A fused loop over rays, compiled by numba for all cores: about the least that a forward pass takes on a CPU."""
+    """A fused loop over rays, compiled by numba for all cores: about the shortest forward pass on a CPU."""
 
     def __init__(self, delta: np.ndarray, steps: int) -> None:
         import numba

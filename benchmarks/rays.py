@@ -2,14 +2,14 @@
 
     python benchmarks/rays.py [--voxels 64 256 256] [--steps 64] [--repeats 5] [--pause 0] [--ways Torchdic ...]
 
-Each way of ray_rivals.py runs in processes of its own, in turn with the others. After a pause a virtual machine's host
-has taken back the memory that one process left, and the next gets it anew, more slowly. A process's time is the least
-of three runs after a first one that compiles and warms up, by wall clock; the table has the processes' median, and in
-brackets their least and most. Memory is the peak of resident memory above what the imports take, likewise.
-Threads: OMP_NUM_THREADS, NUMBA_NUM_THREADS; JAX takes as many as the process may use (`taskset -c 0`). All solve the
-same ODE by as many Runge-Kutta steps of fourth order, through the same smooth random volume, from the same rays, in
-float32, and the table shows that they land alike (mean OPD in µm, and the gradient's absolute sum). A package that
-isn't installed (`pip install torchdic[bench]`) is reported as missing.
+Each way of ray_rivals.py runs in processes of its own, in turn with the others. After a pause the host of a virtual
+machine has taken back the memory of the process before, and the next process gets its memory anew, more slowly. A
+process's time is the least of three runs by wall clock, after a first run that compiles and warms up. The table has the
+median over the processes, and in brackets the least and the most. Memory is the peak of resident memory above what the
+imports take, treated alike. Threads are set by OMP_NUM_THREADS and NUMBA_NUM_THREADS; JAX takes as many as the process
+may use (`taskset -c 0`). All ways solve the same ODE by as many Runge-Kutta steps of fourth order, through the same
+smooth random volume, from the same rays, in float32. The table shows that they agree (mean OPD in µm, and the absolute
+sum of the gradient). A package that isn't installed (`pip install torchdic[bench]`) is reported as missing.
 """
 
 import argparse
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def row(way: str, runs: dict[str, list[float]]) -> str:
-    """A line of the table; a way without a gradient has none."""
+    """A line of the table. A way without a gradient has empty cells for it."""
     cells = []
     for run in ("forward", "gradient"):
         if run not in runs:
@@ -117,7 +117,7 @@ def best(run: Callable) -> tuple:
 
 
 def peak() -> float:
-    """The most memory that this process has held, MiB."""
+    """The most memory in MiB that this process has held."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -2,10 +2,10 @@
 
     python benchmarks/references.py
 
-- A thin object, imaged by microlith (Mehta & Oldenbourg 2014): largest error at each focus plane, in units of the empty
-  bright field. microlith's defocus is the paraxial one, and it sums in single precision.
-- A smooth ball and a sharp bead, whose exact fields are partial waves: rms difference over the image's standard
-  deviation at each focus plane.
+- A thin object, imaged by microlith (Mehta & Oldenbourg 2014): the largest error at each focus plane, in units of the
+    empty bright field. microlith's defocus is paraxial, and it sums in single precision.
+- A smooth ball and a sharp bead, whose exact fields are sums of partial waves: the rms difference over the image's
+    standard deviation, at each focus plane.
 """
 
 import time

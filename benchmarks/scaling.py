@@ -1,11 +1,12 @@
-"""How time and memory grow: with voxels, rays, sources, images, and steps.
+"""How time and memory grow with voxels, rays, sources, images and steps.
 
     python benchmarks/scaling.py
 
-Times are of forward pass and gradient, process seconds, the least of several in turn; the exponent is the slope of a
-straight line through their logarithms, and the last doubling's own stands beside it, where what doesn't grow weighs
-least. Memory of the steps is what lives between the passes and at most at once in the backward pass, in tensors that
-the run made, beyond the volume's gradient: kept whole, or recomputed in slabs where the budget is small.
+Times are process seconds of the forward pass and gradient, the least of several runs in turn. The exponent is the slope
+of a straight line through the logarithms. Beside it stands the exponent of the last doubling, in which costs that don't
+grow count least. The memory of the steps is what lives between the passes, and at most at once in the backward pass. It
+is counted in tensors that the run made, without the volume's gradient, once with everything kept and once with slabs
+computed again for a small budget.
 """
 
 import math
@@ -56,7 +57,7 @@ def exponent(sizes: Sequence[int], values: Sequence[float]) -> float:
 
 
 def specimen(slices: int, rows: int, columns: int) -> Volume:
-    """Smooth waves of index in float32, learned."""
+    """A learned volume of smooth waves of index in float32."""
     grid = Grid((slices, rows, columns), (0.2, 0.15, 0.15))
     z, y, x = torch.meshgrid(*(grid.coordinates(a, dtype=torch.float32) for a in range(3)), indexing="ij")
     delta = 0.01 * torch.sin(1.3 * y + 0.4 * z) * torch.cos(0.9 * x - 0.3 * z)
@@ -93,7 +94,7 @@ def imaged(propagation: str, sources: int, prisms: int, planes: int) -> Callable
 
 
 def most(run: Callable) -> int:
-    """Most bytes of tensors alive at once, of those that a second run made."""
+    """The most bytes of tensors alive at once, of those that a second run made."""
     run()
     with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as profiler:
         run()

@@ -1,4 +1,4 @@
-"""The images with a known answer in tests/data, as scenes that the model can be run on."""
+"""The images with a known answer in tests/data, as scenes on which the model can be run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ PADDING = 64
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The exact images (prism, focus, y, x) of a specimen through so many µm, and how they were taken."""
+    """The exact images (prism, focus, y, x) of a specimen, its depth in µm, and how the images were taken."""
 
     images: Tensor
     specimen: GaussianBall | Bead
@@ -28,7 +28,7 @@ class Scene:
     acquisition: Acquisition
 
     def volume(self, slices: int) -> Volume:
-        """The specimen in float32 on `slices` slices of its depth."""
+        """The specimen in float32, cut into `slices` slices along its depth."""
         ny, nx = self.images.shape[2:]
         grid = Grid((slices, ny, nx), (self.depth / slices, self.spacing, self.spacing))
         return Volume(grid, self.specimen.delta(grid, dtype=torch.float32), self.specimen.background)
@@ -53,7 +53,7 @@ def sharp_bead() -> Scene:
 
 
 def microscope(data: dict, points: Tensor) -> Microscope:
-    """What took the images, lit along points of n·sinθ (y, x)."""
+    """The microscope that took the images, lit from directions of n·sinθ (y, x)."""
     condenser = Condenser(float(points.norm(dim=1).max()), points)
     return Microscope(float(data["wavelength"]), Objective(float(data["na_objective"])), condenser)
 

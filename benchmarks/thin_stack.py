@@ -2,14 +2,17 @@
 
     python benchmarks/thin_stack.py [--repeats 7] [--threads 1]
 
-The case of tests/data/thin_dic.npz: 129 × 129 pixels, 7 focus planes, 437 directions on a square grid. Rings have the
-second moment of those directions: the grid's steps miss the disc's edge by a little, and by how much they err
-themselves is what 4000 directions on rings, which are as good as the disc, differ by. Errors are the rms and, in
-brackets, the largest over the pixels, in units of the empty bright field: at focus 0 of the reference's images,
-elsewhere, where its defocus is paraxial, of our own 437 directions with the exact one. The rival is what one writes in
-NumPy without further thought: a transform of the object, its transfer functions of each source and plane made
-beforehand, and an inverse one for each source and plane. Times are of one stack in DIC: the least of the repeats, taken
-in turn, of wall clock and of the process.
+The case is that of tests/data/thin_dic.npz: 129 × 129 pixels, 7 focus planes, 437 directions on a square grid. The
+rings have the second moment of those directions, because the grid's steps miss the disc's edge by a little. 4000
+directions on rings are as good as the disc, so their difference from the grid shows how much the grid itself errs.
+
+Errors are the rms over the pixels and, in brackets, the largest, in units of the empty bright field. At focus 0 they
+are differences from the reference's images. Elsewhere the reference's defocus is paraxial, so they are differences from
+our own 437 directions with exact defocus.
+
+The rival is straightforward NumPy: a transform of the object, transfer functions for each source and plane, made
+beforehand, and an inverse transform for each source and plane. Times are those of one stack in DIC, by wall clock and
+of the process, the least of the repeats, taken in turn.
 """
 
 import argparse
@@ -56,7 +59,7 @@ class Case:
             )  # fmt: skip
 
     def errors(self, images: Tensor, exact: Tensor) -> list[str]:
-        """Of DIC and bright field: at focus 0 from the reference, and in the worst plane elsewhere from `exact`."""
+        """Errors of DIC and bright field: at focus 0 from the reference, and from `exact` in the worst other plane."""
         at = self.focus.index(0.0)
         focal, elsewhere = images[:, at, None] - self.expected[:, at, None], images - exact
         cells = []
@@ -67,7 +70,7 @@ class Case:
 
 
 class NumPy:
-    """The sum over all directions, straightforwardly; what doesn't depend on the object is made beforehand."""
+    """The straightforward sum over all directions. What doesn't depend on the object is made beforehand."""
 
     def __init__(self, case: Case) -> None:
         data, (ny, nx) = case.data, case.object.shape

@@ -1,10 +1,11 @@
-"""How OpenMP's threads should wait for each other: an image and its gradient, alone on the machine and not.
+"""How OpenMP's threads should wait for each other: an image and its gradient, on an idle machine and on a busy one.
 
     python benchmarks/threads.py [--repeats 5]
 
-Each way of waiting runs in a process of its own: torch's own, which is to spin on; as the command line has it, which is
-to spin for microseconds (GOMP_SPINCOUNT=1000) and then sleep; to sleep at once (OMP_WAIT_POLICY=PASSIVE); and a single
-thread. Then all again beside a program that keeps one core busy. Seconds are the least of the repeats, by wall clock.
+Each way of waiting runs in a process of its own. torch's own way is to spin on. The command line's way is to spin for
+microseconds (GOMP_SPINCOUNT=1000) and then sleep. The third way is to sleep at once (OMP_WAIT_POLICY=PASSIVE), the
+fourth a single thread. Then all run again beside a program that keeps one core busy. Seconds are the least of the
+repeats, by wall clock.
 """
 
 import argparse
@@ -48,7 +49,7 @@ def main() -> None:
 
 
 def seconds(propagation: str, repeats: int) -> float:
-    """Of an image of 20×64×64 voxels by 16 sources, at 7 planes behind 2 prisms, and its gradient."""
+    """Seconds of an image of 20×64×64 voxels by 16 sources, at 7 planes behind 2 prisms, and its gradient."""
     import torch
 
     from data_synthetic import GaussianBall

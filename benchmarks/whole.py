@@ -2,10 +2,11 @@
 
     python benchmarks/whole.py [--voxels 64 256 256] [--repeats 3] [--propagations projection rays wave]
 
-Each in a process of its own, float32, with the default memory budget. Seconds are the least of the repeats, by wall
-clock and of the process's threads together; the peak of resident memory is above what the imports take. Transforms are
-those of the forward pass, each source's counted, beside the least that the method asks for: an inverse one for each
-source, prism and plane, and before it one of each source's field (projection, rays), or 4 for each source and slab.
+Each propagation runs in a process of its own, in float32, with the default memory budget. Seconds are the least of the
+repeats, by wall clock and of the process's threads together. The peak of resident memory is above what the imports
+take. Transforms are counted in the forward pass, for each source. Beside them stands the smallest number that the
+method needs: an inverse transform for each source, prism and plane, and before it one of each source's field
+(projection, rays) or 4 for each source and slab (wave).
 """
 
 import argparse

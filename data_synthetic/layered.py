@@ -29,7 +29,7 @@ class LayeredMedium(Specimen):
     contrast: Δn within the layer.
     background: index of the medium.
     bottom: z of the first face in µm.
-    thickness: in µm; an infinite one leaves the first face alone.
+    thickness: in µm. If it is infinite, the layer has only its first face.
     edge: half the width in µm over which the index changes at a face.
     A voxel holds the Δn of its centre. Raises ValueError for a thickness or edge not above 0 and for an index below 1.
     """

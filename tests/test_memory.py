@@ -291,7 +291,7 @@ def test_control_groups_leave_what_the_tightest_of_them_leaves(tmp_path, line, f
 
 
 def test_gib_is_what_a_message_counts_in():
-    with pytest.raises(ShortOfMemoryError, match=r"This want at least 3 GiB of memory, 1.5 GiB are free"):
+    with pytest.raises(ShortOfMemoryError, match=r"This need at least 3 GiB of memory, 1.5 GiB are free"):
         machine.check_room(3 << 30, 3 << 29, "This")
     machine.check_room(3 << 30, None, "This")
     assert math.isclose(machine.GIB, 2**30)

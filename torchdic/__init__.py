@@ -1,12 +1,13 @@
-"""torchdic simulates Nomarski DIC images of transparent 3-D specimens, differentiably.
+"""torchdic simulates Nomarski DIC images of transparent 3-D specimens. Every image can be differentiated.
 
 Conventions
 -----------
-Lengths in µm, angles in rad, vacuum wavelength in µm, index dimensionless, optical path difference (OPD) in µm.
-Volumes (z, y, x); images (y, x); transverse vectors (y, x). The origin is the centre of the volume: voxel i has its
-centre at (i − (N−1)/2)·spacing; y grows with the row index (downward on a screen). Light travels toward +z and fields
-vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the full displacement between the two
-beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
+Lengths are in µm, angles in rad, the vacuum wavelength in µm. The index has no unit. The optical path difference (OPD)
+is in µm.
+Volumes have the axes (z, y, x), images (y, x), transverse vectors (y, x). The origin is the centre of the volume: voxel
+i has its centre at (i − (N−1)/2)·spacing. y grows with the row index, downward on a screen. Light travels toward +z,
+and fields vary as exp(+ikz). Focus z_f means that the plane z = z_f is sharp. Shear is the full displacement between
+the two beams. Intensity is relative to the empty bright field, so an empty DIC image equals sin²(bias/2).
 """
 
 from torchdic.errors import (

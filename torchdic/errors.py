@@ -1,13 +1,13 @@
-"""What can go wrong, and what users are warned about: each is one line with the numbers and the law."""
+"""Errors and warnings. Each message is one line with the numbers and the law."""
 
 from jaxtyping import Bool
 from torch import Tensor
 
 
 class BatchWarning(UserWarning):
-    """A warning about a batch of sources, of which the worst of an image's batches speaks for all.
+    """A warning about one batch of sources. An image gives only the worst of its batches' warnings.
 
-    severity: the larger, the worse.
+    severity: how bad it is; the larger, the worse.
     """
 
     def __init__(self, message: str, severity: float = 0.0) -> None:
@@ -16,23 +16,33 @@ class BatchWarning(UserWarning):
 
 
 class SamplingWarning(UserWarning):
-    """The grid is coarser than the light that the microscope lets through."""
+    """The grid is too coarse, or too narrow, for the light that the microscope lets through."""
 
 
 class UnstableError(ValueError):
-    """Light that slabs can't carry: one line with the energy they make and their number, or with the index's fall."""
+    """The wave can't be computed in slabs: they make energy, or the index falls too low for light to go on toward +z.
+
+    The message states the energy and the number of slabs, or the index.
+    """
 
 
 class SlabWarning(BatchWarning):
-    """Slabs too thick for a specimen's contrast: they lose energy."""
+    """Slabs are too thick for the specimen's contrast, so the wave loses energy in them."""
 
 
 class TurnedRaysError(ValueError):
-    """Rays that can't go on toward +z: one line with their number and the law."""
+    """Rays can't go on toward +z, because the index falls to their transverse momentum.
+
+    The message states how many rays, and the law.
+    """
 
     @classmethod
     def of(cls, stopped: Bool[Tensor, " *ray"], where: str = "inside the volume") -> "TurnedRaysError":
-        """For rays of which some have stopped, where the index falls to what they carry."""
+        """The error for a set of rays.
+
+        stopped: (ray), True for each ray that has stopped.
+        where: the place that the message names.
+        """
         return cls(
             f"{int(stopped.sum())} of {stopped.numel()} rays can't go on toward +z: "
             f"{where} the index falls to their transverse momentum"
@@ -40,24 +50,27 @@ class TurnedRaysError(ValueError):
 
 
 class SidewaysError(ValueError):
-    """Rays that leave the volume sideways: one line with how far they are displaced, and what they may be."""
+    """Rays leave the volume sideways. The message states how far they are displaced, and the limit."""
 
 
 class WrapAroundWarning(BatchWarning):
-    """A focus so far from the specimen that its light leaves the array, to wrap around or to be cut."""
+    """The focus is so far from the specimen that its light leaves the array, to wrap around or to be cut."""
 
 
 class ShortOfMemoryError(MemoryError):
-    """A computation that the device has no room for: one line with the bytes wanted, those free, and what helps."""
+    """A computation needs more memory than the device has free.
+
+    The message states the memory that it needs, the memory that is free, and what helps.
+    """
 
 
 class ToleranceWarning(UserWarning):
-    """No fidelity that was tried meets the tolerance; its message says by how much the best one misses it, and why."""
+    """No fidelity that was tried meets the tolerance. The message says by how much the best one misses it, and why."""
 
 
 class StackError(ValueError):
-    """A TIFF that cannot be taken for a stack or a volume: one line with the file, the value and the law."""
+    """A TIFF file can't be read as a stack or a volume. The message states the file, the value and the law."""
 
 
 class StackWarning(UserWarning):
-    """Something in a stack that is worked around and that its owner should know: one line."""
+    """A stack has a flaw that the reader works around, and that the stack's owner should know."""

@@ -13,51 +13,54 @@ ADAPTIVE: frozenset[Solver] = frozenset({"bosh3", "dopri5", "dopri8"})
 
 
 class Checked(Protocol):
-    """What a fidelity asks of a propagation, see `torchdic.propagation.base.Propagation`."""
+    """What a fidelity needs of a propagation; see `torchdic.propagation.base.Propagation`."""
 
     def check(self, fidelity: "Fidelity") -> None:
-        """Raise ValueError where the fidelity asks for what the propagation can't have."""
+        """Raise ValueError if the fidelity asks for something that the propagation can't do."""
         ...
 
 
-# Every propagation by its name. `torchdic.propagation.base.register` adds one; a fidelity names one of them.
+# All propagations by name. `torchdic.propagation.base.register` adds one.
 PROPAGATIONS: dict[str, Checked] = {}
 
 
 @dataclass(frozen=True)
 class Fidelity:
-    """How an image is computed; what it shows is said by Microscope and Acquisition.
+    """How carefully an image is computed. What the image shows is set by Microscope and Acquisition.
 
-    propagation: how light crosses the specimen: "projection" along straight rays, "rays" along bent ones (the ray ODE),
-        "wave" by the split-step solution of the one-way wave equation.
-    steps: equal steps (rays) or slabs (wave) through the whole volume; None is one per slice. Fewer average slices,
-        more subdivide them. Projection ignores it, but for its object_aberration.
-    sources: condenser directions at most, where the condenser names no points of its own. K rings of 2K serve best (8,
-        18, 32, 50, 72, 98, 128, 200): other numbers may not light from opposite sides alike, to which the bright field
-        of a weak phase is sensitive.
-    interpolation: between voxel centres, "linear" or "cubic" (C² spline); the wave reads voxels as they are.
-    solver: torchdiffeq's method for rays. The adaptive ones (bosh3, dopri5, dopri8) hold every single ray to
-        `tolerance` and ignore `steps`.
-    tolerance: largest local error of an adaptive solver, absolute in µm and relative.
-    amplitude: whether rays carry their energy's amplitude; False is for studying what it does.
-    order: of the split step: 2 (4 FFTs a slab) or 1 (2 FFTs).
-    defocus: from where light leaves the specimen to the plane of focus: "exact", by p_z − p_z0, or "paraxial", by
-        −(|p|² − |p0|²)/(2n0), as earlier models have it; inside the specimen waves are exact in either case.
-    band_limit: whether waves that leave the array on their way to a focus are cut, as is right for a specimen that
-        stands alone, and cheaper than the padding that holds them; otherwise they come back in at the opposite side, as
-        is right for a periodic one. A WrapAroundWarning names their part of the light in either case.
-    object_aberration: how the specimen's own defocus of each object point is found, with which it then spreads
-        (Kagalwala & Kanade, Eq. 6): "linear" around an axial ray, "cone" over the condenser's aperture; None leaves it
-        out. Found once an image, by rk4 in `steps` through a cubic spline. It stands in for the amplitude that straight
-        rays lack, or bent ones without `amplitude`, and makes up for about half of it.
-    reference_plane: depth in µm at which rays are turned into a field; None is the slice's centre or face nearest to
-        the |Δn|-weighted mean depth.
-    padding: voxels of the medium around the volume's sides on each side during the computation.
-    memory: bytes that an image may hold at once, its gradient included, beside the volume (see `torchdic.foreseen`).
-        Sources go in batches that stay within it, or within what is free if that is less, and batches are computed
-        again in the backward pass; if a single source wants more, so are its steps, slab by slab. Less than that can't
-        be had: a budget below it is exceeded.
-    Raises ValueError where a value breaks its law.
+    propagation: how light crosses the specimen. "projection" follows straight rays, "rays" follows bent rays (the ray
+        ODE), "wave" solves the one-way wave equation by split steps.
+    steps: number of equal steps (rays) or slabs (wave) through the whole volume. None is one per slice. Fewer steps
+        average slices, more steps subdivide them. Projection uses them only for object_aberration.
+    sources: largest number of condenser directions, if the condenser names no points of its own. K rings of 2K
+        directions serve best (8, 18, 32, 50, 72, 98, 128, 200). Other numbers may not light the specimen alike from
+        opposite sides, and the bright field of a weak phase is sensitive to that.
+    interpolation: of the index between voxel centres: "linear" or "cubic" (C² spline). The wave ignores it and uses
+        the voxels as they are.
+    solver: torchdiffeq's method for the ray ODE. The methods bosh3, dopri5 and dopri8 adapt their steps: they keep the
+        error of every single ray within `tolerance` and ignore `steps`.
+    tolerance: largest local error of an adaptive solver, both absolute in µm and relative.
+    amplitude: whether rays carry an amplitude that conserves energy. False is for studying what the amplitude does.
+    order: of the split step: 2 (4 FFTs per slab) or 1 (2 FFTs per slab).
+    defocus: how light goes from the specimen to the plane of focus: "exact", by p_z − p_z0, or "paraxial", by −(|p|² −
+        |p0|²)/(2n0), as in earlier models. Inside the specimen waves are exact in both cases.
+    band_limit: whether waves that leave the array on their way to a focus are cut. This is right for a specimen that
+        stands alone, and cheaper than the padding that would hold these waves. If False, they come back in at the
+        opposite side, which is right for a periodic specimen. In both cases a WrapAroundWarning states their part of
+        the light.
+    object_aberration: method for the defocus that the specimen itself adds to each object point, by which the point
+        then spreads (Kagalwala & Kanade, Eq. 6): "linear" around an axial ray, "cone" over the condenser's aperture,
+        None leaves it out. The defocus is computed once per image, by rk4 in `steps` through a cubic spline. It stands
+        in for the amplitude, which straight rays lack, and bent rays without `amplitude`. It makes up for about half of
+        it.
+    reference_plane: depth in µm at which rays are turned into a field. None is the slice centre or face nearest to the
+        |Δn|-weighted mean depth.
+    padding: voxels of background added on each side along y and x during the computation.
+    memory: bytes that an image and its gradient may hold at once, without the volume (see `torchdic.foreseen`). Sources
+        are computed in batches that stay within this budget, or within the free memory if that is less. The backward
+        pass computes the batches again. If even a single source needs more, its steps are computed again too, slab by
+        slab. That is the least possible: a smaller budget is exceeded.
+    Raises ValueError if a value breaks its law.
     """
 
     propagation: str = "wave"

@@ -1,4 +1,4 @@
-"""Where a voxel's centre is, and which frequencies an array holds."""
+"""The grid of voxels: where voxel centres are, and which frequencies an array holds."""
 
 import math
 from collections.abc import Sequence
@@ -13,9 +13,10 @@ from torch import Tensor
 class Grid:
     """A box of voxels centred on the origin: voxel i of an axis has its centre at (i − (N−1)/2)·spacing.
 
-    shape: voxels along (z, y, x). spacing: their size along (z, y, x) in µm. The box fills
-    [−N·spacing/2, +N·spacing/2] along each axis, outer faces included.
-    Raises ValueError for anything but three positive whole numbers and three positive lengths.
+    shape: number of voxels along (z, y, x).
+    spacing: voxel size along (z, y, x) in µm.
+    The box fills [−N·spacing/2, +N·spacing/2] along each axis, outer faces included.
+    Raises ValueError unless shape is three whole numbers of at least 1 and spacing three lengths above 0.
     """
 
     shape: tuple[int, int, int]
@@ -36,15 +37,15 @@ class Grid:
         return tuple(n * d for n, d in zip(self.shape, self.spacing, strict=True))  # pyright: ignore[reportReturnType]
 
     def centre(self, axis: int, index: float) -> float:
-        """The coordinate in µm of the (fractional) voxel index along one axis."""
+        """The coordinate in µm of a voxel index along one axis. The index may be fractional."""
         return (index - (self.shape[axis] - 1) / 2) * self.spacing[axis]
 
     def index(self, axis: int, coordinate: float) -> float:
-        """The fractional voxel index of a coordinate in µm: the inverse of `centre`."""
+        """The voxel index, possibly fractional, of a coordinate in µm along one axis: the inverse of `centre`."""
         return coordinate / self.spacing[axis] + (self.shape[axis] - 1) / 2
 
     def widened(self, rows: int, columns: int) -> "Grid":
-        """The same voxels with so many more on each side along y and x; the centre stays the centre."""
+        """The grid with more voxels on each side: `rows` along y, `columns` along x. Its centre stays the same."""
         nz, ny, nx = self.shape
         return replace(self, shape=(nz, ny + 2 * rows, nx + 2 * columns))
 

@@ -1,7 +1,7 @@
 """Fields as sums of plane waves: their spectra, and the momenta of the waves along z.
 
-Everything is done on the envelope of each source, its tilt removed: the envelope's frequency f is the field's f + f_s,
-f_s = p0/λ. So the envelope of an unperturbed plane wave is 1.
+Each source's field is represented by its envelope, which is the field without the source's tilt. The envelope's
+frequency f belongs to the field's frequency f + f_s, with f_s = p0/λ. The envelope of an unperturbed plane wave is 1.
 """
 
 from typing import Any
@@ -20,10 +20,14 @@ def axial_difference(
     momentum: Float[Tensor, "source 2"],
     frequencies: Float[Tensor, "*source 2 y x"] | None = None,
 ) -> tuple[Float[Tensor, "source y x"], Float[Tensor, "source y x"]]:
-    """p_z(f + f_s) − p_z0 and p_z(f + f_s) of each source's waves; p_z is 0 where a wave is evanescent.
+    """p_z(f + f_s) − p_z0 and p_z(f + f_s) of each source's waves, (source, y, x); p_z is 0 if a wave is evanescent.
 
-    frequencies: f in 1/µm; None is all of the grid's. The difference is formed without cancellation, so float32 keeps
-    the phase of a long path.
+    grid: of the field.
+    wavelength: in vacuum, µm.
+    background: the index n0, 0-d.
+    momentum: n·sinθ (y, x) of each source's direction, (source, 2).
+    frequencies: f in 1/µm, (2, y, x) or (source, 2, y, x). None is all frequencies of the grid.
+    The difference is computed without cancellation, so float32 keeps the phase of a long path.
     """
     deflection = wavelength * _frequencies(grid, momentum, frequencies)
     p0 = momentum[:, :, None, None]
@@ -42,7 +46,10 @@ def paraxial_difference(
     momentum: Float[Tensor, "source 2"],
     frequencies: Float[Tensor, "*source 2 y x"] | None = None,
 ) -> Float[Tensor, "source y x"]:
-    """−(|p|² − |p0|²)/(2n0), p_z − p_z0 to second order in the momenta p at f + f_s; frequencies: see above."""
+    """p_z − p_z0 to second order in the momenta p at f + f_s: −(|p|² − |p0|²)/(2n0).
+
+    The arguments are those of `axial_difference`.
+    """
     deflection = wavelength * _frequencies(grid, momentum, frequencies)
     return -(deflection * (deflection + 2 * momentum[:, :, None, None])).sum(1) / (2 * background)
 
@@ -52,14 +59,14 @@ def _frequencies(grid: Grid, momentum: Tensor, given: Tensor | None) -> Tensor:
 
 
 def exp_i(phase: Tensor) -> Tensor:
-    """exp(i·phase) of a real phase, or of a complex one where light is absorbed."""
-    if phase.is_complex():  # in real parts, five times as fast as torch.exp
+    """exp(i·phase). The phase is real, or complex if light is absorbed."""
+    if phase.is_complex():  # five times as fast as torch.exp of a complex number
         return exp_i(phase.real) * torch.exp(-phase.imag)
     return _ExpI.apply(phase)  # pyright: ignore[reportReturnType]
 
 
 class _ExpI(torch.autograd.Function):
-    """Five times as fast as torch.polar on the CPU, and keeps its result alone."""
+    """exp(i·phase) of a real phase, five times as fast as torch.polar on the CPU. It keeps only its result."""
 
     @staticmethod
     def forward(ctx: Any, phase: Tensor) -> Tensor:
@@ -74,15 +81,15 @@ class _ExpI(torch.autograd.Function):
 
 
 def to_spectrum(field: Tensor) -> Tensor:
-    """Amplitudes of the plane waves that make up a field (…, y, x): 1 at f = 0 for a field of 1."""
+    """Amplitudes of the plane waves that make up a field (…, y, x). A field of 1 has the amplitude 1 at f = 0."""
     return torch.fft.fft2(field, norm="forward")
 
 
 def to_field(spectrum: Tensor, shape: tuple[int, int] | None = None) -> Tensor:
-    """The field (…, y, x) of the plane waves in a spectrum, which zeros make up to `shape`."""
+    """The field (…, y, x) of a spectrum. shape: the field's (y, x), to which zeros are appended to the spectrum."""
     return torch.fft.ifft2(spectrum, s=shape, norm="forward")
 
 
 def axial_momentum(background: Float[Tensor, " *#ray"], momentum: Float[Tensor, "*#ray 2"]) -> Float[Tensor, " *#ray"]:
-    """p_z = √(n0² − |p|²) where the index is n0."""
+    """p_z = √(n0² − |p|²) in the index n0."""
     return (background**2 - momentum.square().sum(-1)).sqrt()

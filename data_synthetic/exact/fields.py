@@ -81,7 +81,7 @@ def radial_field(
 ) -> Complex[Tensor, "source y x"]:
     """The field behind a ball of radial index n(r): envelopes (source, y, x), complex128.
 
-    index: a function from distances r from the centre in µm to n, a numpy array each. It is asked for r < radius only.
+    index: a function from distances r from the centre in µm to n, a numpy array each. Only r < radius is evaluated.
     radius: in µm; beyond it there is medium. A jump of the index at the radius costs no accuracy, but one inside does.
         Choose the radius at a sharp surface, or where n equals the medium's to rounding.
     step: largest step of the radial integration in µm; the error falls with its fourth power. None is 1/100 of the
@@ -95,11 +95,14 @@ def radial_field(
 
 @dataclass(frozen=True)
 class _Window:
-    """Where a field is wanted, and which of its waves.
+    """Where a field is computed, and from which waves.
 
-    grid: its (y, x) pixels. plane: depth in µm. centre: of the ball, (z, y, x) in µm. padding: the array whose period
-    the waves have is so many times the grid's. na: aperture to which the waves are limited; None keeps all.
-    Raises ValueError where a value breaks its law.
+    grid: its (y, x) pixels.
+    plane: depth in µm.
+    centre: of the ball, (z, y, x) in µm.
+    padding: period of the waves, in sides of the grid.
+    na: largest aperture of the waves; None keeps all waves.
+    Raises ValueError if a value breaks its law.
     """
 
     grid: Grid

@@ -1,7 +1,8 @@
-"""Memory foreseen: what an image will hold at once, and whether there is room for it, before it is computed.
+"""The memory that an image will hold at once, and whether there is room for it, found before it is computed.
 
-It is measured on a small sample of the scene, see `torchdic.forward.sample`. What a sample holds depends on the scene's
-shapes and not on its values, so each kind of scene is measured once.
+It is measured on a small sample of the scene, see `torchdic.forward.sample`. The memory of a sample depends on the
+scene's shapes and not on its values, so each kind of scene is measured once. Rays are an exception: their memory also
+depends on how much of the array is empty, so that this is part of the kind.
 """
 
 import math
@@ -23,15 +24,15 @@ from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
 from torchdic.specimen.volume import Volume
 
-# Bytes that a batch on the CPU may hold where nothing is kept for a gradient: its arrays stay in the caches, up to 1.4
-# times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
+# Bytes that a batch on the CPU may hold if no gradient is wanted. Its arrays then stay in the caches, which is up to
+# 1.4 times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
-# More bytes than any scene holds for each pixel and source, and for each slice and image where a gradient is wanted. A
-# scene that fits into its budget even so is computed at once and not measured.
+# More bytes than any scene holds for each source and pixel. With a gradient they count for each slice and image. If a
+# scene fits into its budget even by this number, it is computed at once and not measured.
 AMPLE = 2048
-# The same for the map of an object aberration, which serves all sources: as many times AMPLE for each pixel and slice.
+# The map of an object aberration serves all sources: it holds less than this many times AMPLE for each pixel and slice.
 MAP = 40
-# Kinds of scenes whose measurements are kept.
+# Number of kinds of scenes whose measurements are kept.
 KEPT = 32
 _measured: "OrderedDict[Hashable, Sample]" = OrderedDict()
 
@@ -44,10 +45,12 @@ def foreseen(
     *,
     gradient: bool | None = None,
 ) -> Foreseen:
-    """What `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
+    """The memory that `image` of the same arguments will hold at once, found without computing it; see `Foreseen`.
 
-    gradient: whether one is wanted, to the volume at least; None is as `image` would find it, by what requires grad.
-    An object_aberration of the fidelity is found, because the memory depends on how strong it is.
+    volume, microscope, acquisition, fidelity: as for `image`.
+    gradient: whether a gradient is wanted, at least with respect to the volume. None decides as `image` does, by which
+        tensors require grad.
+    If the fidelity names an object_aberration, its map is computed, because the memory depends on how strong it is.
     """
     levels = 0
     if fidelity.object_aberration is not None:
@@ -61,10 +64,10 @@ def foreseen(
 def allot(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 0
 ) -> Batches:
-    """The batches in which `image` computes within its budget and what is free.
+    """The batches in which `image` stays within its budget and within the free memory.
 
-    levels: of an object aberration, as far as they are known. Raises ShortOfMemoryError where even single sources,
-    their steps computed again, want more than is free.
+    levels: number of levels of an object aberration; 0 if it isn't known yet.
+    Raises ShortOfMemoryError if even single sources, whose steps are computed again, need more memory than is free.
     """
     grid = volume.grid.widened(fidelity.padding, fidelity.padding)
     slices, images = grid.shape[0], len(acquisition.prisms) * len(acquisition.focus)

@@ -19,15 +19,19 @@ def image(
 ) -> Float[Tensor, "prism focus y x"]:
     """Images of a volume, relative to the empty bright field.
 
-    Pixels are the volume's (y, x) voxel centres, or those of a camera that has a pixel size. Raises ValueError where an
-    aperture exceeds the medium's index, and ShortOfMemoryError where it would take more memory than is free; warns with
-    SamplingWarning where the voxels are coarser than the light.
+    volume: the specimen.
+    microscope: what takes the images.
+    acquisition: the prisms and focus planes to image.
+    fidelity: how carefully to compute.
+    The result has the shape (prism, focus, y, x). Its pixels are the volume's (y, x) voxel centres, or those of a
+    camera that has a pixel size. Raises ValueError if an aperture exceeds the medium's index, and ShortOfMemoryError if
+    the computation needs more memory than is free. Warns with SamplingWarning if the voxels are coarser than the light.
     """
     check_apertures(microscope, number(volume.background), volume.delta.dtype)
     check_sampling(microscope, volume.grid)
     batches = allot(volume, microscope, acquisition, fidelity)
     passage = Passage.through(volume, microscope, acquisition, fidelity)
-    if passage.levels:  # how many there are is known now, and how much memory they take
+    if passage.levels:  # their number is now known, and with it the memory that they need
         batches = allot(volume, microscope, acquisition, fidelity, passage.most_levels)
     return passage.images(batches)
 
@@ -43,10 +47,13 @@ def image_field(
 ) -> Float[Tensor, "prism focus y x"]:
     """Images of a thin complex transmission at z = 0, relative to the empty bright field.
 
-    transmission: (y, x), the same for every source, or (source, y, x), each source's own envelope (its tilt removed) in
-    the order of the microscope's sources. grid: its pixels (the number of slices plays no part). background: index of
-    the medium. Raises ValueError as `image` does, where a shape is not the grid's, and for light of a spectrum, in each
-    of whose wavelengths a transmission is another one.
+    transmission: (y, x) if it is the same for every source. (source, y, x) is each source's own envelope (the field
+        without the source's tilt), in the order of the microscope's sources.
+    grid: the transmission's pixels. The number of slices has no effect.
+    microscope, acquisition, fidelity: as for `image`.
+    background: index of the medium.
+    The result has the shape (prism, focus, y, x). Raises ValueError as `image` does, if a shape is not the grid's, and
+    for light of a spectrum, because the transmission would differ between its wavelengths.
     """
     if microscope.spectrum is not None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The light's way from a specimen to the images, in batches of sources."""
+"""The path of light from a specimen to its images, in batches of sources."""
 
 from dataclasses import dataclass
 
@@ -22,10 +22,13 @@ from torchdic.specimen.volume import Volume
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """From a volume to its images: what is made once and serves every batch of sources.
+    """From a volume to its images. It holds what is computed once and serves every batch of sources.
 
-    volume: padded. plane: depth in µm to which the crossing refers its light. levels: of the object aberration, one for
-    each colour; empty where the fidelity names none.
+    volume: with its padding.
+    microscope, acquisition, fidelity: as for `torchdic.image`.
+    plane: depth in µm of the plane to which the crossing refers its light.
+    crossing: the light's way through the volume.
+    levels: of the object aberration, one for each colour. Empty if the fidelity names none.
     """
 
     volume: Volume
@@ -40,7 +43,7 @@ class Passage:
     def through(
         cls, volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 2
     ) -> "Passage":
-        """The passage of a volume that isn't padded yet; levels: of an object aberration at least."""
+        """The passage of a volume without padding. levels: smallest number of levels of an object aberration."""
         propagation = propagation_of(fidelity)
         plane = propagation.reference_plane(volume, fidelity)
         padded = volume.padded(fidelity.padding)
@@ -53,11 +56,11 @@ class Passage:
 
     @property
     def most_levels(self) -> int:
-        """Levels of the colour that has most; 0 where there are none."""
+        """The largest number of levels of any colour; 0 if there are no levels."""
         return max((len(levels.defocus) for levels in self.levels), default=0)
 
     def images(self, batches: Batches) -> Float[Tensor, "prism focus y x"]:
-        """The images of all colours, whose sources are computed in batches."""
+        """The images in all colours together. Sources are computed in batches."""
         colours = self.microscope.colours()
         levels = self.levels or (None,) * len(colours)
         images = [share * self._image(part, own, batches) for (part, share), own in zip(colours, levels, strict=True)]
@@ -84,7 +87,7 @@ class Passage:
         return seen(total, volume.grid, fidelity.padding, microscope)
 
     def _spread(self, field: Tensor, levels: Levels, microscope: Microscope, momentum: Tensor) -> Tensor:
-        """The spectrum of a field each of whose points has a defocus of its own."""
+        """The spectrum of a field in which each point has its own defocus."""
         waves = self.volume.grid, microscope.wavelength, self.volume.background, momentum
         paraxial = self.fidelity.defocus == "paraxial"
         difference = paraxial_difference(*waves) if paraxial else axial_difference(*waves)[0]
@@ -95,8 +98,10 @@ class Passage:
 class FieldPassage:
     """From a field at z = 0 to its images.
 
-    transmission: (y, x), the same for every source, or (source, y, x). grid: its pixels, without padding. background:
-    index of the medium, 0-d.
+    transmission: (y, x), the same for every source, or (source, y, x).
+    grid: its pixels, without padding.
+    background: index of the medium, 0-d.
+    microscope, acquisition, fidelity: as for `torchdic.image`.
     """
 
     transmission: Complex[Tensor, "*source y x"]
@@ -107,7 +112,7 @@ class FieldPassage:
     fidelity: Fidelity
 
     def images(self, batches: Batches) -> Float[Tensor, "prism focus y x"]:
-        """The images, whose sources are computed in batches."""
+        """The images. Sources are computed in batches."""
         pad, real = self.fidelity.padding, self.transmission.real
         grid = self.grid.widened(pad, pad)
         spectra = to_spectrum(F.pad(self.transmission, (pad,) * 4, value=1.0))
@@ -127,7 +132,12 @@ class FieldPassage:
 def seen(
     images: Float[Tensor, "prism focus row column"], grid: Grid, padding: int, microscope: Microscope
 ) -> Float[Tensor, "prism focus y x"]:
-    """Images on a padded grid's pixels without their padding, or on the camera's pixels if it has any."""
+    """Images without their padding, or on the camera's pixels if it has a pixel size.
+
+    images: (prism, focus, row, column) on the padded grid, or on a coarser array, from which they are interpolated.
+    grid: with padding.
+    padding: voxels on each side.
+    """
     _, ny, nx = grid.shape
     images = interpolate(images, (ny, nx))
     camera = microscope.camera

@@ -45,17 +45,21 @@ class Sample:
     def peak(self, batches: Batches) -> int:
         """The most bytes that the scene holds at once."""
         count, several = batches.sources, batches.sources < self._sources
-        one = self._course(1 + several, Batches(1, batches.slabs))
-        if count == 1:
-            held = most(one)
-        else:
-            held = extrapolated(one, self._course(2 * (1 + several), Batches(2, batches.slabs)), count)
+        held = most(self._course(min(count, 2), batches.slabs, several=several))
+        if count > 2:
+            two, three = (self._course(parts, batches.slabs, several=several) for parts in (2, 3))
+            held = extrapolated(two, three, count)
         if self._apart and several:
-            further = most(self._course(3, Batches(1))) - most(self._course(2, Batches(1)))
-            held += further * (self._sources - 2 * count)
+            # two single sources, and three: the third one's field is held beside them
+            pair, three = (most(self._run_of(sources, Batches(1))) for sources in (2, 3))
+            held += (three - pair) * (self._sources - 2 * count)
         return math.ceil(self._scale * held)
 
-    def _course(self, sources: int, batches: Batches) -> Course:
+    def _course(self, count: int, slabs: bool, *, several: bool) -> Course:
+        """The course of a batch of so many sources, the only one or one of two."""
+        return self._run_of(count * (1 + several), Batches(count, slabs))
+
+    def _run_of(self, sources: int, batches: Batches) -> Course:
         if (sources, batches) not in self._courses:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # the scene itself will warn

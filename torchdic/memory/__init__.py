@@ -1,1 +1,1 @@
-"""What memory is free, what a computation holds, and how it is kept within bounds. It knows no optics."""
+"""Memory: how much is free, how much a computation holds, and how it is limited. Nothing here depends on optics."""

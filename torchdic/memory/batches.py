@@ -1,4 +1,4 @@
-"""Memory bounded: sources in batches, and intermediate values recomputed where there is no room to keep them."""
+"""Limits on memory: sources in batches, and intermediate values that are computed again instead of kept."""
 
 import math
 import warnings
@@ -17,7 +17,10 @@ T = TypeVar("T")
 
 
 def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
-    """function(*arguments), whose intermediate values are computed again in the backward pass instead of kept."""
+    """function(*arguments).
+
+    when: whether the backward pass computes the function's intermediate values again, so that they need not be kept.
+    """
     if not (when and torch.is_grad_enabled()):
         return function(*arguments)
     return checkpoint(  # pyright: ignore[reportReturnType]
@@ -30,10 +33,11 @@ def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
 
 
 def replay(function: Callable[..., Tensor], *tensors: Tensor, when: bool) -> Tensor:
-    """As `recompute`, of a function of these tensors alone; no graph is built before the backward pass.
+    """Like `recompute`, for a function of tensors only. No graph is built before the backward pass.
 
-    A graph's nodes are small and lie between the large temporaries, whose memory glibc (2.36) then hardly uses again:
-    to hold 1 GiB, a gradient took 8 from the system.
+    function: must depend on no learned tensor besides `tensors`.
+    A graph's nodes are small and lie between large temporary arrays, whose memory glibc (2.36) then hardly uses again:
+    a gradient that held 1 GiB took 8 GiB from the system.
     """
     if not (when and torch.is_grad_enabled()):
         return function(*tensors)
@@ -59,7 +63,7 @@ class _Replayed(torch.autograd.Function):
 
 
 def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
-    """Steps 0 … steps as consecutive (first, last) ranges: about √steps of them where `split`, or a single one."""
+    """Steps 0 … steps as consecutive ranges (first, last): about √steps ranges if `split`, else a single one."""
     if steps == 0:
         return
     count = math.isqrt(steps - 1) + 1 if split else 1
@@ -68,7 +72,11 @@ def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
 
 
 def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
-    """Σ of function(batch of each tensor) over batches of `size` sources; several are computed again when needed."""
+    """The sum of function(batch of each tensor) over batches of `size` sources.
+
+    per_source: tensors whose first axis is the source.
+    If there are several batches, the backward pass computes each of them again.
+    """
     if size >= len(per_source[0]):
         return function(*per_source)
     batches = zip(*(t.split(size) for t in per_source), strict=True)
@@ -81,7 +89,7 @@ def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, 
 
 @contextmanager
 def _worst_of_each_kind() -> Iterator[None]:
-    """Of the BatchWarnings within, only the worst of each kind is given, at the end."""
+    """Of each kind of BatchWarning give only the worst, at the end. Other warnings pass through."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
@@ -101,7 +109,7 @@ def _worst_of_each_kind() -> Iterator[None]:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """What is computed again has been warned about."""
+    """Ignore every BatchWarning: a second computation would repeat those of the first."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BatchWarning)
         yield

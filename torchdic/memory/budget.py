@@ -1,4 +1,4 @@
-"""How many sources are computed at once, so that what is held stays within a budget."""
+"""How many sources are computed at once, so that the memory they hold stays within a budget."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -9,7 +9,8 @@ from dataclasses import dataclass
 class Batches:
     """How the sources of an image are computed.
 
-    sources: in a batch. slabs: whether the steps of each batch are computed again in the backward pass, slab by slab.
+    sources: number of sources in a batch.
+    slabs: whether the backward pass computes the steps of each batch again, slab by slab.
     """
 
     sources: int
@@ -18,11 +19,12 @@ class Batches:
 
 @dataclass(frozen=True)
 class Foreseen:
-    """What an image will hold at once, in bytes of tensors beyond the volume, and how its sources are computed.
+    """The memory that an image will hold at once, in bytes of tensors without the volume, and its batches.
 
-    peak: at most, the backward pass included where a gradient is wanted. least: the least that it can be brought to, by
-    single sources whose steps are computed again; equal to `peak` where the budget is smaller. sources, slabs: see
-    `Batches`.
+    peak: the largest number of bytes held at once, with the backward pass if a gradient is wanted.
+    least: the smallest peak that is possible: single sources, whose steps are computed again. A budget below it is
+    exceeded, and `peak` then equals `least`.
+    sources, slabs: see `Batches`.
     """
 
     peak: int
@@ -31,16 +33,17 @@ class Foreseen:
     slabs: bool = False
 
 
-# Bytes that are held at most when a batch has so many sources.
+# The largest number of bytes held at once when sources are computed in these batches.
 Peak = Callable[[Batches], int]
 
 
 def ways(sources: int, *, gradient: bool, small_batches: bool) -> Iterator[Batches]:
-    """Ways to compute that many sources, from the one that is fastest to the one that holds least.
+    """Ways to compute that many sources, from the fastest to the one that holds least.
 
-    All at once; all at once with their steps in slabs; batches of equal size; single sources with their steps in slabs.
-    gradient: without one nothing is kept, and there are no slabs. small_batches: whether small batches are faster than
-    slabs.
+    They are: all at once; all at once, with their steps in slabs; batches of equal size; single sources, with their
+    steps in slabs.
+    gradient: whether a gradient is wanted. Without one nothing is kept, so there are no slabs.
+    small_batches: whether small batches are faster than slabs.
     """
     yield Batches(sources)
     if gradient and not small_batches:
@@ -52,13 +55,13 @@ def ways(sources: int, *, gradient: bool, small_batches: bool) -> Iterator[Batch
 
 
 def least_of(peak: Peak, sources: int, *, gradient: bool, small_batches: bool) -> int:
-    """The least that can be held at once, in bytes: by all sources or by single ones."""
+    """The smallest number of bytes that can be held at once, with all sources at once or with single ones."""
     tried = ways(sources, gradient=gradient, small_batches=small_batches)
     return min(peak(way) for way in tried if way.sources in (1, sources))
 
 
 def fitted(peak: Peak, sources: int, budget: int, *, gradient: bool, small_batches: bool) -> Batches:
-    """The first of the `ways` that stays within a budget in bytes, or else the one that holds least."""
+    """The first of the `ways` that stays within a budget in bytes. If none does, the one that holds least."""
     tried = ways(sources, gradient=gradient, small_batches=small_batches)
     first = next(tried)
     if peak(first) <= budget:

@@ -1,4 +1,4 @@
-"""Memory that a device has left, and whether there is room."""
+"""How much memory a device has free, and whether a computation fits into it."""
 
 import math
 from pathlib import Path
@@ -12,25 +12,30 @@ GIB = 1 << 30
 
 
 def check_room(wanted: int, free: int | None, what: str) -> None:
-    """Raise ShortOfMemoryError where a computation wants more bytes than are free; None: nobody knows what is."""
+    """Raise ShortOfMemoryError if a computation needs more bytes than are free.
+
+    wanted: bytes that it needs.
+    free: bytes that are free. None means unknown, and then nothing is refused.
+    what: the computation, as the message names it.
+    """
     if free is not None and wanted > free:
         raise ShortOfMemoryError(
-            f"{what} want at least {wanted / GIB:.3g} GiB of memory, {free / GIB:.3g} GiB are free; fewer voxels, "
-            "prism settings, focus planes or steps, less padding or another propagation want less"
+            f"{what} need at least {wanted / GIB:.3g} GiB of memory, {free / GIB:.3g} GiB are free; fewer voxels, "
+            "prism settings, focus planes or steps, less padding or another propagation need less"
         )
 
 
 def check_volume(grid: Grid, copies: int, device: torch.device) -> None:
-    """Raise ShortOfMemoryError where so many float32 arrays of a grid, not made yet, would have no room."""
+    """Raise ShortOfMemoryError if so many float32 arrays of a grid would not fit into the device's free memory."""
     wanted = copies * math.prod(grid.shape) * torch.float32.itemsize
     check_room(wanted, free_bytes(device), f"{copies} arrays of {'×'.join(map(str, grid.shape))} voxels")
 
 
 def free_bytes(device: torch.device) -> int | None:
-    """Bytes that a device has left for tensors; None where that isn't known.
+    """Bytes that a device has free for tensors; None if that isn't known.
 
-    On the CPU what Linux counts as available, and what this process's control groups leave of their limits; on CUDA
-    what the device has left, and what torch's allocator holds of it unused.
+    On the CPU this is the memory that Linux counts as available, or what the process's control groups leave of their
+    limits if that is less. On CUDA it is what the device has free, and what torch's allocator holds unused.
     """
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
@@ -42,7 +47,7 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def available(table: Path = Path("/proc/meminfo")) -> int | None:
-    """Linux's own estimate of what can be had without swapping."""
+    """Bytes that can be had without swapping, by Linux's own estimate; None if it can't be read."""
     try:
         lines = table.read_text(encoding="ascii").splitlines()
     except OSError:
@@ -52,7 +57,10 @@ def available(table: Path = Path("/proc/meminfo")) -> int | None:
 
 
 def left_by_groups(root: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> list[int]:
-    """What each of the process's control groups (version 2, or 1's memory controller) leaves of its limit."""
+    """Bytes that each of the process's control groups leaves of its limit.
+
+    The groups are those of version 2, or of version 1's memory controller.
+    """
     try:
         lines = membership.read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -67,7 +75,7 @@ def left_by_groups(root: Path = Path("/sys/fs/cgroup"), membership: Path = Path(
         else:
             continue
         group = base / path.strip("/")
-        # a container sees its own group as the root, whatever its name outside
+        # inside a container its own group is the root, whatever its name outside
         for folder in {group, *group.parents, base}:
             if folder.is_relative_to(base):
                 left += _left_by_group(folder, *names)
@@ -82,6 +90,6 @@ def _left_by_group(folder: Path, most: str, now: str, cached: str) -> list[int]:
         lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
     except OSError:
         return []
-    # files' pages that no one has used of late are given back first
+    # cached pages of files count as free: the system takes back those that were not used lately
     files = sum(int(line.split()[1]) for line in lines if line.split()[0] == cached)
     return [max(0, int(limit) - int(used) + files)]

@@ -1,4 +1,4 @@
-"""What a computation holds: the bytes of all tensors that it makes, counted while it runs."""
+"""The memory that a computation holds: the bytes of all tensors that it makes, counted while it runs."""
 
 import weakref
 from collections.abc import Callable, Iterable, Iterator
@@ -9,26 +9,28 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-# Operations in a row by which two runs are found to agree again.
+# Two runs agree again where this many operations in a row are the same.
 ALIKE = 8
 
 
 class Allocation(NamedTuple):
-    """A tensor's memory taken from the system: by which operation, and the bytes in use after it."""
+    """An allocation of memory for a tensor: the operation that made it, and the bytes in use after it."""
 
     operation: str
     held: int
 
 
-# All allocations of a run, one after the other.
+# All allocations of a run, in order.
 Course = list[Allocation]
 
 
 class Held(TorchDispatchMode):
-    """Counts, while it is entered, the bytes of the tensors that were made in it and are still in use.
+    """Counts the bytes of the tensors that were made while it is entered and are still in use.
 
-    bytes: in use now. course: the allocations so far. Tensors that were there before don't count, and neither do the
-    workspaces that a kernel takes and gives back within one operation.
+    bytes: in use now.
+    course: the allocations so far.
+    Tensors that existed before don't count. Nor does the workspace that a kernel takes and gives back within one
+    operation.
     """
 
     def __init__(self) -> None:
@@ -39,11 +41,11 @@ class Held(TorchDispatchMode):
 
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
-        """Nothing is compiled here, so that torch's compiler, which takes seconds to load, need not be told."""
+        """False: nothing is compiled here, and the default loads torch's compiler, which takes seconds."""
         return False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        """Run one operation, and count what it has made."""
+        """Run one operation, and count the memory of the tensors that it makes."""
         result = func(*args, **(kwargs or {}))
         for made in _tensors((result,)):
             storage = made.untyped_storage()
@@ -54,7 +56,7 @@ class Held(TorchDispatchMode):
         return result
 
     def _meet(self, storage: torch.UntypedStorage, size: int, func: Any) -> None:
-        """Count a storage that is met for the first time, until it is freed."""
+        """Count a storage from its first appearance until it is freed."""
         key = storage._cdata
         self._known[key] = weakref.ref(storage, partial(self._forget, key, size))
         if size:
@@ -67,7 +69,7 @@ class Held(TorchDispatchMode):
 
 
 def _tensors(values: Iterable[object]) -> Iterator[Tensor]:
-    """The tensors among an operation's arguments or results, which may come in lists."""
+    """The tensors among an operation's arguments or results, some of which may be lists."""
     for value in values:
         if isinstance(value, Tensor):
             yield value
@@ -76,42 +78,43 @@ def _tensors(values: Iterable[object]) -> Iterator[Tensor]:
 
 
 def course_of(run: Callable[[], object]) -> Course:
-    """The allocations of a function."""
+    """The allocations that a function makes when it runs."""
     with Held() as held:
         run()
     return held.course
 
 
 def most(course: Course) -> int:
-    """The most bytes in use at once."""
+    """The largest number of bytes in use at once."""
     return max((allocation.held for allocation in course), default=0)
 
 
-def extrapolated(one: Course, two: Course, count: int) -> int:
-    """The most bytes that `count` equal parts hold at once, from the courses of one part and of two.
+def extrapolated(two: Course, three: Course, count: int) -> int:
+    """The most bytes that `count` equal parts hold at once, from the courses of two parts and of three parts.
 
-    The bytes after each allocation that both runs make are linear in the number of parts, and the largest of these
-    lines counts: one stage may hold the most in a small run, another one in a large run. Where the second run makes
-    allocations for each of its parts in turn, those of its first part and those of its last one are compared.
+    After each allocation that both runs make, the bytes in use are linear in the number of parts. Each of these lines
+    is extended to `count` parts, and the largest result counts: one stage may hold the most in a small run, another
+    stage in a large run. Where a run makes allocations for each of its parts in turn, the first parts of both runs are
+    compared, and the last ones. (A single part would not do: its arrays of length 1 are treated in other ways.)
     """
-    forward, backward = aligned(one, two), aligned(one[::-1], two[::-1])
-    return max((a + (b - a) * (count - 1) for a, b in (*forward, *backward)), default=0)
+    forward, backward = aligned(two, three), aligned(two[::-1], three[::-1])
+    return max((a + (b - a) * (count - 2) for a, b in (*forward, *backward)), default=0)
 
 
-def aligned(one: Course, two: Course) -> Iterator[tuple[int, int]]:
-    """The bytes after each allocation of one run beside those after the same one of a run that may make more.
+def aligned(one: Course, other: Course) -> Iterator[tuple[int, int]]:
+    """The bytes after each allocation of one run, beside those after the same allocation of a second run.
 
-    Where the operations differ, allocations of the second run are skipped until both agree again; where they do not
-    agree again, the first run's allocation is.
+    Where the operations differ, allocations of the second run are skipped until both agree again. Where they do not
+    agree again, the first run's allocation is skipped.
     """
-    if len(one) == len(two):
-        yield from ((a.held, b.held) for a, b in zip(one, two, strict=True))
+    if len(one) == len(other):
+        yield from ((a.held, b.held) for a, b in zip(one, other, strict=True))
         return
-    first, second = ([allocation.operation for allocation in course] for course in (one, two))
-    most_skipped = max(len(two) - len(one), 0) + ALIKE
+    first, second = ([allocation.operation for allocation in course] for course in (one, other))
+    most_skipped = max(len(other) - len(one), 0) + ALIKE
     j = 0
     for i, operation in enumerate(first):
-        if j >= len(two):
+        if j >= len(other):
             return
         if second[j] != operation:
             ahead = first[i : i + ALIKE]
@@ -120,17 +123,17 @@ def aligned(one: Course, two: Course) -> Iterator[tuple[int, int]]:
             if found is None:
                 continue
             j = found
-        yield one[i].held, two[j].held
+        yield one[i].held, other[j].held
         j += 1
 
 
 def crowded(step: Callable[[], object], steps: int, budget: int) -> bool:
-    """Whether that many steps keep more than a budget in bytes for the backward pass, by what the first one keeps.
+    """Whether that many steps keep more bytes than a budget for the backward pass, if each keeps what the first keeps.
 
     step: runs the first step and returns its result.
     """
     with Held() as held:
         result = step()
-    kept = held.bytes  # the result holds its graph, and the graph what it saved
+    kept = held.bytes  # the result keeps its graph alive, and the graph keeps what it saved
     del result
     return kept * steps > budget

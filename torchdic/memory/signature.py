@@ -1,4 +1,4 @@
-"""What of some values decides how much memory a computation with them holds."""
+"""What decides how much memory a computation holds: the kinds and shapes of its arguments, not their values."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -13,8 +13,8 @@ T = TypeVar("T")
 def signature(part: object) -> Hashable:
     """A key of a number, tensor, dataclass, sequence or mapping.
 
-    Of a tensor it holds the shape, the dtype and whether it is learned. Computations with two parts of the
-    same signature hold the same memory.
+    For a tensor the key holds the shape, the dtype and whether the tensor is learned. Computations whose arguments have
+    the same signature hold the same memory.
     """
     if isinstance(part, Tensor):
         return tuple(part.shape), part.dtype, part.requires_grad
@@ -42,7 +42,7 @@ def is_learned(part: object) -> bool:
 
 
 def stand_in(part: T) -> T:
-    """A copy on the CPU whose tensors are leaves of their own: a gradient to them leaves the part as it is."""
+    """A copy on the CPU whose tensors are leaves of their own, so that its gradients don't reach the original."""
     if isinstance(part, Tensor):
         return part.detach().cpu().clone().requires_grad_(part.requires_grad)  # pyright: ignore[reportReturnType]
     if isinstance(part, Mapping):

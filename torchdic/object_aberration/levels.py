@@ -1,17 +1,18 @@
-"""Space-variant defocus: each object point spreads with the defocus of its own (Kagalwala & Kanade, Eq. 6).
+"""Space-variant defocus: each object point spreads with its own defocus (Kagalwala & Kanade, Eq. 6).
 
 Light of the point x' of the field U at the reference plane reaches the lens as if the point lay nearer by δ(x'):
-    S(f) = Σ_x' U(x')·exp(−2πi f·x')·exp(−i k0 δ(x') q(f)),    q = p_z(f + f_s) − p_z0,
-which is no convolution. The last factor is interpolated between K levels δ_k that span the field's δ,
-    S(f) = Σ_k F[U·w_k](f)·exp(−i k0 δ_k q(f)),    Σ_k w_k = 1:
-the Chebyshev nodes with their Lagrange polynomials w_k(δ), smooth in δ as hat functions are not. Of a phase
-that spans ±b rad the coefficients are Bessel functions, 2|J_j(b)| ≤ 2(b/2)^j/j!, so from K ≥ b on the error is below
+    S(f) = Σ_x' U(x')·exp(−2πi f·x')·exp(−i k0 δ(x') q(f)),    q = p_z(f + f_s) − p_z0.
+This is no convolution. The last factor is therefore interpolated between K levels δ_k that span the field's δ:
+    S(f) = Σ_k F[U·w_k](f)·exp(−i k0 δ_k q(f)),    Σ_k w_k = 1.
+The levels are the Chebyshev nodes, and w_k(δ) are their Lagrange polynomials, which are smooth in δ (hat functions are
+not). For a phase that spans ±b rad the coefficients are Bessel functions, 2|J_j(b)| ≤ 2(b/2)^j/j!. So from K ≥ b on the
+error is below
     4·Σ_{j ≥ K} |J_j(b)| ≤ 8·(b/2)^K/K!,    b = k0·max|q|·(δ_max − δ_min)/2.
-K is the least for which that is a rounding: 9 levels for b = 1 in float32, as many as hat functions in steps of
-0.25 rad take, which leave 1 %.
+K is the smallest number for which this is a rounding error: 9 levels for b = 1 in float32. As many hat functions, in
+steps of 0.25 rad, leave an error of 1 %.
 
 δ is the object's aberration for an axial ray, the same for all sources. It stands in for the amplitude that straight
-rays lack; a field that has it, of rays with their amplitude or of waves, would count it twice.
+rays lack. Rays with their amplitude and waves have it already, and would count it twice.
 """
 
 import math
@@ -28,16 +29,20 @@ from torchdic.plane_waves import exp_i, to_spectrum
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
-# Levels at most: light that leaves collimated has δ without bound.
+# Largest number of levels: δ is without bound where light leaves collimated.
 MOST_LEVELS = 128
 
-# Least phase in rad that the levels span: slopes of a narrower one would drown in its rounding.
+# Smallest phase in rad that the levels span: in a narrower one, rounding would hide the slopes.
 LEAST_SPAN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Depths δ_k by which object points seem nearer, (level,) in µm, and each point's shares in them, (level, y, x)."""
+    """Depths by which object points seem nearer, and how each point is shared among them.
+
+    defocus: the levels δ_k in µm, (level,).
+    share: w_k of each point, (level, y, x).
+    """
 
     defocus: Float[Tensor, " level"]
     share: Float[Tensor, "level y x"]
@@ -48,7 +53,12 @@ class Levels:
         wavelength: float,
         difference: Float[Tensor, "source y x"],
     ) -> Complex[Tensor, "source *component y x"]:
-        """Spectrum of a field whose points spread each with its own defocus; difference: p_z(f + f_s) − p_z0."""
+        """The spectrum of a field in which each point spreads with its own defocus.
+
+        field: (source, y, x) or (source, component, y, x).
+        wavelength: in vacuum, µm.
+        difference: p_z(f + f_s) − p_z0, (source, y, x).
+        """
         k0 = 2 * math.pi / wavelength
         difference = difference.reshape(len(difference), *[1] * (field.ndim - 3), *difference.shape[1:])
         parts = (
@@ -61,10 +71,12 @@ class Levels:
 def object_levels(volume: Volume, plane: float, microscope: Microscope, fidelity: Fidelity, least: int = 2) -> Levels:
     """Levels of the volume's own aberration at depth `plane` (µm), by the method that the fidelity names.
 
-    microscope: of one wavelength. least: levels at least.
-    The map's rays are those of `CAREFUL`, a cubic spline crossed by rk4, in the fidelity's steps. A cone's half angle
-    is asin(NA_c/n0), a choice of where to look that carries no gradient. Raises ValueError for a cone without a
-    condenser's aperture, and as `effective_defocus` and `levels` do.
+    volume: with its padding.
+    microscope: of one wavelength.
+    least: smallest number of levels.
+    The rays for the map are those of `CAREFUL`, traced by rk4 through a cubic spline, in the fidelity's steps. A cone's
+    half angle is asin(NA_c/n0). It only says where to look, so it carries no gradient. Raises ValueError for a cone
+    without a condenser's aperture, and as `effective_defocus` and `levels` do.
     """
     n0 = number(volume.background)
     half_angle = None
@@ -84,17 +96,20 @@ def object_levels(volume: Volume, plane: float, microscope: Microscope, fidelity
     steepest = float(momentum.detach().norm(dim=-1).max())
     objective = microscope.objective
     reach = n0 if objective is None else min(n0, max(objective.na, steepest))
-    # the paraxial difference is the smaller one
+    # the exact difference; the paraxial one is smaller
     rate = 2 * math.pi / microscope.wavelength * (n0 - math.sqrt(n0**2 - reach**2))
     return levels(defocus, rate, least=least)
 
 
 def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None = None, *, least: int = 2) -> Levels:
-    """Levels for a field's δ (y, x) in µm, where the phase changes by at most `rate` rad per µm of it.
+    """Levels for a field's δ (y, x) in µm.
 
-    tolerance: largest error of the factor exp(−i k0 δ q); None is a rounding of δ's dtype. least: levels at
-    least. The levels themselves carry no gradient: but for rounding the field does not depend on them. Raises
-    ValueError where δ is not finite, or asks for more than MOST_LEVELS.
+    defocus: δ.
+    rate: largest change of the phase, in rad per µm of δ.
+    tolerance: largest error of the factor exp(−i k0 δ q). None is a rounding error of δ's dtype.
+    least: smallest number of levels.
+    The depths of the levels carry no gradient, because the field does not depend on them, except for rounding. Raises
+    ValueError if δ is not finite, or needs more than MOST_LEVELS.
     """
     low, high = (float(v) for v in torch.aminmax(defocus.detach()))
     if not (math.isfinite(low) and math.isfinite(high)):
@@ -120,7 +135,7 @@ def levels(defocus: Float[Tensor, "y x"], rate: float, tolerance: float | None =
 
 
 def _count(span: float, tolerance: float) -> int:
-    """Levels that interpolate exp(iφ), |φ| ≤ span, to the tolerance; see the module's head."""
+    """The number of levels that interpolate exp(iφ), |φ| ≤ span, to the tolerance; see the module's docstring."""
     count = max(2, math.ceil(span))
     while math.log(8) + count * math.log(span / 2) - math.lgamma(count + 1) > math.log(tolerance):
         count += 1

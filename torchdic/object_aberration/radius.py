@@ -1,6 +1,6 @@
-"""From what leaves the last face to the wave's radii of curvature in the axial ray's frame.
+"""The wave's radii of curvature in the axial ray's frame, from the rays that leave the last face.
 
-Momenta and directions come with their components (y, x) first.
+The first axis of momenta and directions holds their components (y, x).
 """
 
 import math
@@ -12,23 +12,30 @@ from torchdic.plane_waves import axial_momentum
 from torchdic.rays.pair import LinearPair
 from torchdic.rays.trace import Deviation
 
-# Rays of a cone: rings at these fractions of its half angle, with so many rays each, in opposite pairs (no coma).
+# Rays of a cone: rings at these fractions of its half angle, with this many rays each, in opposite pairs (no coma).
 RINGS, AZIMUTHS = (0.5, 1.0), 8
 
 
 def cosine_behind(p: Tensor, n0: Tensor) -> Tensor:
-    """Cosθ in the background of rays of momentum p (2, …)."""
+    """Cosθ in the background for rays of momentum p (2, …)."""
     return axial_momentum(n0, p.movedim(0, -1)) / n0
 
 
 def tilt(direction: Tensor, cosine: Tensor) -> Tensor:
-    """T⁻¹ = I + (cosθ − 1) p̂p̂ᵀ, (…, 2, 2), without p̂, which a ray along z does not have."""
+    """T⁻¹ = I + (cosθ − 1) p̂p̂ᵀ, (…, 2, 2), computed without p̂, which a ray along z does not have."""
     outer = direction[:, None] * direction[None] / (1 + cosine)
     return torch.eye(2).to(direction) - outer.movedim((0, 1), (-2, -1))
 
 
 def linear_radius(leaving: LinearPair, p: Tensor, n0: Tensor, cosine: Tensor, nearness: Tensor) -> Tensor:
-    """M = R(I + cR)⁻¹ = n0 T⁻¹ Q (P + c n0 T⁻² Q)⁻¹ T⁻¹ from the linear pair."""
+    """M = R(I + cR)⁻¹ = n0 T⁻¹ Q (P + c n0 T⁻² Q)⁻¹ T⁻¹ from the linear pair, (…, 2, 2) in µm.
+
+    leaving: the pair at the last face.
+    p: the axial rays' momenta there, (2, …).
+    n0: index of the background.
+    cosine: cosθ of the axial rays.
+    nearness: c in 1/µm.
+    """
     Q, P, T = leaving.q, leaving.p, tilt(p / n0, cosine)
     spread = P + nearness[..., None, None] * n0 * (T @ T @ Q)
     (a, b), (c, d) = (row.unbind(-1) for row in spread.unbind(-2))
@@ -37,7 +44,13 @@ def linear_radius(leaving: LinearPair, p: Tensor, n0: Tensor, cosine: Tensor, ne
 
 
 def cone_around(p0: Tensor, n0: Tensor, half_angle: float) -> Tensor:
-    """Momenta (2, 1 + ray, …) of a cone in the background around p0 (2, …), which comes first."""
+    """Momenta (2, 1 + ray, …) of a cone of rays in the background. The axial ray comes first.
+
+    p0: momenta of the axial rays, (2, …).
+    n0: index of the background.
+    half_angle: of the cone, in rad.
+    Raises ValueError if the cone reaches 90° from z.
+    """
     direction, cosine = p0 / n0, cosine_behind(p0, n0)
     steepest = math.degrees(float(cosine.detach().min().acos())) if cosine.numel() else 0.0
     if not steepest + math.degrees(half_angle) < 90:
@@ -47,7 +60,7 @@ def cone_around(p0: Tensor, n0: Tensor, half_angle: float) -> Tensor:
         )
     angle = half_angle * torch.tensor(RINGS, dtype=torch.float64).repeat_interleave(AZIMUTHS)
     azimuth = 2 * math.pi / AZIMUTHS * torch.arange(AZIMUTHS, dtype=torch.float64).repeat(len(RINGS))
-    # the rings turned against each other see more azimuths
+    # the rings are turned against each other, so that together they have more azimuths
     azimuth = azimuth + math.pi / AZIMUTHS * torch.arange(len(RINGS)).repeat_interleave(AZIMUTHS)
     across = (angle.sin() * torch.stack((azimuth.sin(), azimuth.cos()))).to(p0)
     turned = (tilt(direction, cosine) @ across).movedim((-2, -1), (0, 1))
@@ -56,10 +69,16 @@ def cone_around(p0: Tensor, n0: Tensor, half_angle: float) -> Tensor:
 
 
 def cone_radius(leaving: Deviation, cone: Tensor, n0: Tensor, length: float, nearness: Tensor) -> Tensor:
-    """M by the fit of `torchdic.object_aberration.wavefront`, with u, v in units of the lens's distance L.
+    """M by the fit of `torchdic.object_aberration.wavefront`, (…, 2, 2) in µm.
 
-    d: unit directions, the axial one first; s = d − d_a. Seen from the axial ray's end, a ray reaches its phase at
-    e + sL, and the sphere through there that is normal to the axial ray has the radius L + h,
+    u, v are in units of the lens's distance L.
+    leaving: the cone's rays at the last face.
+    cone: their momenta at the start; the axial ray comes first.
+    n0: index of the background.
+    length: from the object points to the last face along z, µm.
+    nearness: c in 1/µm.
+    Let d be the unit directions, d_a the axial one, and s = d − d_a. Seen from the axial ray's end, a ray reaches the
+    same phase at e + sL. The sphere through this point that is normal to the axial ray has the radius L + h with
         h = (c|e|² + 2e·d)/(|s|² − 2c e·d_a).
     """
     displacement, deflection = (v.movedim(-1, 0) for v in (leaving.position, leaving.momentum))

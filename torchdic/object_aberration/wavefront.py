@@ -1,22 +1,26 @@
 """The specimen's own aberration: where the lens finds each object point (Kagalwala & Kanade, section 3.3).
 
-An object point sends its light through the rest of the specimen. At the lens, around one ray of it, the axial one,
-equal phase is a surface of mean curvature H, where the lens law images sharply what has H0 = cosθ/(z_L − f): f is the
-plane of focus, z_L the lens, θ the axial ray's angle behind the specimen. Where H = H0 the point is sharp, so its
-effective defocus is δ = f − z_s = z_L − cosθ/H − z_s. It is 0 in a homogeneous medium; under a plate of thickness t
-and index n it is the apparent shift t(1 − n0/n).
+An object point sends its light through the rest of the specimen to the lens. One of its rays is called the axial ray.
+Around it, at the lens, the surface of equal phase has the mean curvature H. The lens law images a point sharply if this
+curvature is H0 = cosθ/(z_L − f), where f is the plane of focus, z_L the lens and θ the axial ray's angle behind the
+specimen. So the point is sharp at the f with H = H0, and its effective defocus is δ = f − z_s = z_L − cosθ/H − z_s. It
+is 0 in a homogeneous medium. Under a plate of thickness t and index n it is the apparent shift t(1 − n0/n).
 
-H is found in two ways. "cone": a cone of rays is traced from the point, and with (u, v) across the axial ray and the
-depth w along it, ρ² = u² + v², the surface of equal phase is fitted by
-    2wρ²/(ρ² + w²) = κ11 u² + 2 κ12 uv + κ22 v²,    H = ½ tr κ,
-which for a sphere is exact at any angle (a parabola's radius would err by R·half²/4). "linear": the limit of a narrow
-cone, the linear pair Q = ∂x/∂p_s, P = ∂p/∂p_s carried along the axial ray (`torchdic.rays.pair`), and the radii of
-curvature R = n0 T⁻¹ Q P⁻¹ T⁻¹, where T⁻¹ = I + (cosθ − 1) p̂p̂ᵀ turns from the plane z = const into the axial
-ray's frame.
+H is found in two ways.
 
-A lens is far: κ differs from 1/L by little, and by nothing at infinity. So both ways find M = R(I + cR)⁻¹, c = 1/L the
-inverse of the lens's distance along the axial ray from the last face, which stays finite there: κ = c(I − cM), and with
-m = ½ tr M the sharp plane is f = z_e − cosθ·m/(1 − cm).
+"cone": a cone of rays is traced from the point. With (u, v) across the axial ray, w the depth along it and ρ² = u² +
+v², the surface of equal phase is fitted by
+    2wρ²/(ρ² + w²) = κ11 u² + 2 κ12 uv + κ22 v²,    H = ½ tr κ.
+For a sphere this is exact at any angle (the radius of a parabola would err by R·half²/4).
+
+"linear": the limit of a narrow cone. The linear pair Q = ∂x/∂p_s, P = ∂p/∂p_s is carried along the axial ray
+(`torchdic.rays.pair`). The radii of curvature are R = n0 T⁻¹ Q P⁻¹ T⁻¹, where T⁻¹ = I + (cosθ − 1) p̂p̂ᵀ turns from the
+plane z = const into the axial ray's frame.
+
+A lens is far away: κ differs little from 1/L, and not at all at infinity. Here c = 1/L is the inverse of the lens's
+distance from the last face along the axial ray. Both ways therefore compute M = R(I + cR)⁻¹, which stays finite for a
+lens at infinity. Then κ = c(I − cM), and with m = ½ tr M the sharp plane is f = z_e − cosθ·m/(1 − cm), where z_e is the
+last face.
 """
 
 import math
@@ -36,7 +40,7 @@ from torchdic.rays.solver import TABLEAUX
 from torchdic.rays.trace import Rays, deviation
 from torchdic.specimen.volume import Volume
 
-# How carefully rays are traced: of a fidelity solver, steps, interpolation and memory are read.
+# How carefully rays are traced. Only the fidelity's solver, steps, interpolation and memory are used.
 CAREFUL = replace(STANDARD, interpolation="cubic")
 
 
@@ -44,10 +48,12 @@ CAREFUL = replace(STANDARD, interpolation="cubic")
 class Wavefront:
     """The wave from each object point as the lens sees it around the axial ray.
 
-    plane: depth z_s of the object points in µm. face: depth of the volume's last face in µm. cosine: (…), cosθ of the
-    axial ray behind the specimen. nearness: (…), c = cosθ/(z_L − face) in 1/µm, 0 for a lens at infinity.
-    radius: (…, 2, 2) in µm, M = R(I + cR)⁻¹, R the radii of curvature at the last face; axes (y, x) turned with the
-    shortest turn from z to the axial ray.
+    plane: depth z_s of the object points in µm.
+    face: depth z_e of the volume's last face in µm.
+    cosine: (…), cosθ of the axial ray behind the specimen.
+    nearness: (…), c = cosθ/(z_L − face) in 1/µm, 0 for a lens at infinity.
+    radius: (…, 2, 2) in µm, M = R(I + cR)⁻¹ with the radii of curvature R at the last face. Its axes are (y, x) after
+        the shortest turn from z to the axial ray.
     """
 
     plane: float
@@ -69,13 +75,13 @@ class Wavefront:
 
     @property
     def sharp_plane(self) -> Float[Tensor, " *point"]:
-        """Plane of focus that makes the point sharp, f = z_L − cosθ/H, (…) in µm."""
+        """The plane of focus in which the point is sharp, f = z_L − cosθ/H, (…) in µm."""
         m = self._mean_radius
         return self.face - self.cosine * m / (1 - self.nearness * m)
 
     @property
     def defocus(self) -> Float[Tensor, " *point"]:
-        """δ = f − z_s, (…) in µm: how much nearer to the lens than it is the point seems."""
+        """δ = f − z_s, (…) in µm: how much nearer to the lens the point seems than it is."""
         return self.sharp_plane - self.plane
 
     @property
@@ -94,10 +100,11 @@ def effective_defocus(
     half_angle: float | None = None,
     lens: float = math.inf,
 ) -> Float[Tensor, " *point"]:
-    """The specimen's effective defocus δ in µm of object points at depth `plane`; arguments as of `wavefront`.
+    """The specimen's effective defocus δ in µm of object points at depth `plane`.
 
-    Shape (y, x) for one direction and the voxel centres, else that of points and momentum broadcast. Positive where the
-    point seems nearer to the lens than it is. Differentiable in the volume.
+    The arguments are those of `wavefront`. δ has the shape (y, x) for one direction and the voxel centres, otherwise
+    that of points and momentum broadcast. It is positive if the point seems nearer to the lens than it is. It is
+    differentiable in the volume.
     """
     seen = wavefront(volume, plane, momentum, fidelity, points=points, method=method, half_angle=half_angle, lens=lens)
     return seen.defocus
@@ -116,18 +123,23 @@ def wavefront(
 ) -> Wavefront:
     """The wave from object points at depth `plane` (µm, within the volume) as the lens sees it.
 
-    momentum: (…, 2), n·(transverse direction) of the axial ray at the object point; None is along z. points: (…, 2),
-    (y, x) in µm; None are the voxel centres. method: "linear" is the limit of a narrow cone; "cone" traces one of
-    half_angle (rad, in the background: asin(NA_c/n0) for a condenser's aperture), and approaches it with the square of
-    the angle. lens: depth z_L in µm of the lens, behind the volume; at infinity, the default, H⁻¹ − L becomes the mean
-    radius of curvature.
+    volume: the specimen.
+    plane: depth of the object points in µm.
+    momentum: (…, 2), n·(transverse direction) of the axial ray at the object point. None is along z.
+    fidelity: its solver, steps, interpolation and memory are used.
+    points: (…, 2), (y, x) in µm. None is the voxel centres.
+    method: "linear" is the limit of a narrow cone. "cone" traces a cone of half_angle, and its result approaches that
+        limit with the square of the angle.
+    half_angle: in rad, in the background. For a condenser's aperture it is asin(NA_c/n0).
+    lens: depth z_L of the lens in µm, behind the volume. The default is infinity, for which H⁻¹ − L becomes the mean
+        radius of curvature.
 
-    A cone's rounding grows as eps·extent/half_angle²: narrow ones want float64. δ is unbounded where the light leaves
-    collimated. Of `fidelity` solver, steps, interpolation and memory are read.
+    A cone's rounding error grows as eps·extent/half_angle², so narrow cones need float64. δ is without bound where the
+    light leaves collimated.
 
     Raises ValueError for a plane outside the volume, a lens inside it, an adaptive solver, linear interpolation with
-    method "linear", half_angle missing or without a use, a cone that reaches 90° from the axis, and where rays can't go
-    on toward +z.
+    method "linear", a half_angle that is missing or has no use, a cone that reaches 90° from the axis, and rays that
+    can't go on toward +z.
     """
     _check(volume, plane, fidelity, method, half_angle, lens)
     grid, n0 = volume.grid, volume.background

@@ -1,1 +1,1 @@
-"""How light crosses the specimen: straight rays, bent rays and waves, an object each."""
+"""How light crosses the specimen: straight rays, bent rays and waves. Each way is one object."""

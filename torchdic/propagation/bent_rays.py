@@ -23,11 +23,11 @@ class BentRays(Propagation):
     name = "rays"
     carries_polarisation = True
     small_batches = True
-    # where rays go straight on, each corner of the two triangles beside a pixel falls on a pixel: 8 pairs instead of 2
+    # rays that go straight on land just on pixels, which gives 8 pairs of triangle and pixel to test per pixel, not 2
     holds_by_content = True
 
     def check(self, fidelity: Fidelity) -> None:
-        """The amplitude of rays is what an object aberration stands in for."""
+        """An object aberration stands in for the amplitude, so rays can't have both."""
         if fidelity.object_aberration is not None and fidelity.amplitude:
             raise ValueError(
                 f"object_aberration {fidelity.object_aberration!r} double-counts what the rays' amplitude does: "
@@ -39,11 +39,11 @@ class BentRays(Propagation):
         return TracedRays(volume.sampled(fidelity.interpolation), fidelity, plane, polarised)
 
     def work(self, grid: Grid, fidelity: Fidelity, *, absorbs: bool) -> float:
-        """Every step solves the ray ODE for each pixel."""
+        """The ray ODE is solved for each pixel in every step."""
         return (fidelity.steps or grid.shape[0]) * STEP
 
     def rungs(self, grid: Grid, margin: int) -> Iterable[tuple[Fidelity, str | None]]:
-        """With few sources, in long steps: more of either costs much and gains little."""
+        """Few sources and long steps: more of either costs much and gains little."""
         steps = max(1, grid.shape[0] // 4)
         return [(Fidelity(self.name, sources=sources, steps=steps), None) for sources in (12, 24)]
 

@@ -1,6 +1,6 @@
 """Straight rays: the specimen's projection along each source's direction, without an ODE.
 
-It is the limit of the ray equations for weak contrast, where dW/dz = √(n² − |p0|²) − p_z0 along the unperturbed ray.
+This is the limit of the ray equations for weak contrast, where dW/dz = √(n² − |p0|²) − p_z0 along the unperturbed ray.
 """
 
 import math
@@ -34,15 +34,15 @@ class Projection(Propagation):
         return StraightRays(volume.sampled(fidelity.interpolation), plane)
 
     def work(self, grid: Grid, fidelity: Fidelity, *, absorbs: bool) -> float:
-        """Every slice is sampled once, and its absorption too."""
+        """Each slice of the index is sampled once, and each slice of the absorption too."""
         return grid.shape[0] * SLICE[fidelity.interpolation] * (2 if absorbs else 1)
 
     def planned(self) -> Iterable[Fidelity]:
-        """The cheapest image of all."""
+        """The cheapest image."""
         return [Fidelity(self.name)]
 
     def rungs(self, grid: Grid, margin: int) -> Iterable[tuple[Fidelity, str | None]]:
-        """With few sources, and with the usual number."""
+        """Few sources, and the usual number."""
         return [(Fidelity(self.name, sources=12), None), (Fidelity(self.name), None)]
 
 
@@ -75,9 +75,12 @@ def project(
 ) -> Complex[Tensor, "source y x"]:
     """Each source's envelope as seen at depth `plane` (µm).
 
-    wavelength: in vacuum, µm. momentum: n·sinθ (y, x) of each source's direction. slabs: whether slices are summed
-    again in the backward pass, slab by slab. Raises TurnedRaysError where the index on a ray falls below its transverse
-    momentum.
+    volume: sampled.
+    wavelength: in vacuum, µm.
+    momentum: n·sinθ (y, x) of each source's direction, (source, 2).
+    plane: depth in µm.
+    slabs: whether the backward pass sums the slices again, slab by slab.
+    Raises TurnedRaysError if the index on a ray falls below its transverse momentum.
     """
     grid, n0 = volume.grid, volume.background
     index, *absorption = volume.samplers()

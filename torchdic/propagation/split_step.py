@@ -18,25 +18,27 @@ from torchdic.plane_waves import axial_difference, axial_momentum, exp_i, to_fie
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
-# Floor of p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. Against exact fields of sharp
-# beads floors from 0.1 to 0.4 err alike (benchmarks/exact_fields.py); the lower, the thinner the slabs that strong
-# steps of the index want.
+# Smallest p_z in the factor 1/p_z, which is unbounded for waves that graze the slices. On exact fields of sharp beads
+# the errors are alike for floors from 0.1 to 0.4 (benchmarks/exact_fields.py). A lower floor needs thinner slabs where
+# the index has strong steps.
 LOWEST_PZ = 0.3
 
-# Energy up to which waves may grow, where none can be made: beyond it their growth is the slabs', not the specimen's.
+# Largest energy behind the volume, over the energy that came in. A specimen makes no energy, so any more comes from the
+# slabs.
 MOST_ENERGY = 1.1
 
-# Energy down to which waves may fall where nothing absorbs: beyond it the slabs lose it to waves that they cut.
+# Smallest energy behind the volume, over the energy that came in, if nothing absorbs. Slabs that lose more lose it
+# to waves that they cut.
 LEAST_ENERGY = 0.9
 
 
 def _root(square: Tensor) -> Tensor:
-    """√ of real numbers, or of complex ones that aren't 0."""
+    """The root of real numbers, or of complex numbers that aren't 0."""
     return _ComplexRoot.apply(square) if square.is_complex() else square.sqrt()  # pyright: ignore[reportReturnType]
 
 
 class _ComplexRoot(torch.autograd.Function):
-    """In real parts, six times as fast as torch.sqrt on the CPU."""
+    """The root of complex numbers, six times as fast as torch.sqrt on the CPU."""
 
     @staticmethod
     def forward(ctx: Any, square: Tensor) -> Tensor:
@@ -63,17 +65,21 @@ def split_step(
     *,
     slabs: bool = False,
 ) -> Complex[Tensor, "source y x"]:
-    """Spectrum of each source's envelope on the volume's last face.
+    """Spectrum of each source's envelope on the volume's last face, (source, y, x).
 
-    wavelength: in vacuum, µm. momentum: n·sinθ (y, x) of each source's direction. Of `fidelity` steps and order are
-    read. slabs: whether steps are computed again in the backward pass, slab by slab.
+    volume: with its padding.
+    wavelength: in vacuum, µm.
+    momentum: n·sinθ (y, x) of each source's direction, (source, 2).
+    fidelity: its steps and order are used.
+    slabs: whether the backward pass computes the steps again, slab by slab.
 
     The textbook's phase screen k0·Δn·dz is wrong for oblique light, because the effect of Δn depends on the angle after
-    scattering as well as before: with B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen
-    φ = k0 dz B/(√(n² − |p0|²) + p_z0), exact for a slab along the source, is followed by the factor
-    G² = p_z0/p_z(f + f_s) on what it scatters, to first or second order in φ. Raises UnstableError where the slabs are
-    so thick that this makes energy, or the index falls below a source's |p0|; warns with SlabWarning where they lose
-    energy though nothing absorbs.
+    scattering as well as before. With B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen is φ =
+    k0 dz B/(√(n² − |p0|²) + p_z0), which is exact for a slab along the source. What it scatters is multiplied by G² =
+    p_z0/p_z(f + f_s), to first or second order in φ.
+
+    Raises UnstableError if the slabs are so thick that this makes energy, or if the index falls below a source's |p0|.
+    Warns with SlabWarning if the slabs lose energy although nothing absorbs.
     """
     steps = fidelity.steps or volume.grid.shape[0]
     dz = volume.grid.extent[0] / steps
@@ -84,7 +90,7 @@ def split_step(
 
     difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
     H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
-    # −1 takes out what a screen scatters into evanescent waves, before the next half of it can scatter that back
+    # −1 removes what a screen scatters into evanescent waves, before the next half of the screen can scatter it back
     excess = torch.where(pz > 0, pz0 / pz.clamp_min(LOWEST_PZ) - 1, -1)
 
     advance = _first_order if fidelity.order == 1 else _second_order
@@ -124,9 +130,9 @@ def _second_order(phi: Tensor, S: Tensor, H: Tensor, excess: Tensor) -> Tensor:
 
 @torch.no_grad()
 def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps: int) -> None:
-    """Σ p_z|S|² of each source, p_z0 in front of the specimen, grows where a slab scatters more than there is.
+    """Check the energy Σ p_z|S|² of each source's waves, which is p_z0 in front of the specimen.
 
-    It falls where a slab scatters into evanescent waves, which carry none.
+    It grows if a slab scatters more than there is. It falls if a slab scatters into evanescent waves, which carry none.
     """
     flux = (pz * torch.view_as_real(S).square().sum(-1)).sum((1, 2))
     least, most = torch.stack(torch.aminmax(flux / axial_momentum(volume.background, momentum))).tolist()
@@ -151,17 +157,17 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
             f"{least:.3g} times the energy that came in, and nothing absorbs; use more than {steps} steps",
             severity=1 - least,
         ),
-        stacklevel=3,  # torch.no_grad is a call between
+        stacklevel=3,  # torch.no_grad adds a call
     )
 
 
 def slab_mean(slices: Sequence[Tensor], step: int, steps: int) -> Tensor:
-    """The mean of a field over the given one of `steps` equal slabs through its slices."""
+    """The mean of a field over slab number `step` of `steps` equal slabs. slices: the field's, in order."""
     n = len(slices)
     first, last = step * n // steps, -(-(step + 1) * n // steps)
     if last - first == 1:
         return slices[first]
-    # slab and slices on a common ruler, steps to the slice
+    # in units in which a slice is `steps` long and a slab n, so that overlaps are whole numbers
     overlaps = [min((step + 1) * n, (i + 1) * steps) - max(step * n, i * steps) for i in range(first, last)]
     total: Tensor = sum(o * slices[first + i] for i, o in enumerate(overlaps))  # pyright: ignore[reportAssignmentType]
     return total / n

@@ -13,18 +13,18 @@ from torchdic.propagation.base import Crossing, Propagation, ToSpectrum
 from torchdic.propagation.split_step import split_step
 from torchdic.specimen.volume import Volume
 
-# Work of a slab in FFTs of a field by its order, and more where light is absorbed, measured on a CPU from 64² to 256²
-# pixels.
+# Work of a slab in FFTs of a field, by its order, and further work if light is absorbed. Measured on a CPU from 64² to
+# 256² pixels.
 SLAB, ABSORBING = {1: 3.5, 2: 5.0}, 5.0
 
 
 class Wave(Propagation):
-    """The one-way wave equation, in slabs."""
+    """The one-way wave equation, solved in slabs."""
 
     name = "wave"
 
     def check(self, fidelity: Fidelity) -> None:
-        """A wave's field spreads by itself."""
+        """A wave needs no object aberration: its field spreads by itself."""
         if fidelity.object_aberration is not None:
             raise ValueError(
                 f'object_aberration {fidelity.object_aberration!r} has no use in propagation "{self.name}", whose '
@@ -40,17 +40,17 @@ class Wave(Propagation):
         return SplitStep(volume, fidelity)
 
     def work(self, grid: Grid, fidelity: Fidelity, *, absorbs: bool) -> float:
-        """Every slab takes the Fourier transforms of its order."""
+        """Each slab takes the Fourier transforms of its order."""
         return (fidelity.steps or grid.shape[0]) * (SLAB[fidelity.order] + (ABSORBING if absorbs else 0.0))
 
     def describe(self, fidelity: Fidelity) -> list[str]:
-        """Its slabs and their order."""
+        """The number of slabs, and their order."""
         steps = fidelity.steps
         slabs = "a slab a slice" if steps is None else f"{steps} slab{'' if steps == 1 else 's'}"
         return [f"{slabs} of order {fidelity.order}"]
 
     def rungs(self, grid: Grid, margin: int) -> Iterable[tuple[Fidelity, str | None]]:
-        """From few sources, slabs and orders to many, in float64 once, and with padding."""
+        """From few sources, slabs and orders to many, once in float64, and with padding."""
         slices = grid.shape[0]
         few, half, twice = max(1, slices // 4), max(1, slices // 2), 2 * slices
         return [

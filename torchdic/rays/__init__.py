@@ -1,1 +1,1 @@
-"""Rays through a gradient of index: their equation, its solution, caustics, and the mesh of rays that land."""
+"""Rays through a gradient of index: their equation, its solution, caustics, and the field that the rays make."""

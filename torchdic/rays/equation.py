@@ -1,14 +1,14 @@
 """The right-hand side of the ray ODE (see `torchdic.rays.trace`), and its derivative written out by hand.
 
-Autograd would keep every intermediate value: some 27 for each ray and evaluation where the index is linear, 115 where
-it is a cubic spline. By hand the backward pass needs where a ray was and what it met there. With p = p0 + δp,
-n = n0 + Δn, v = p0/p_z0 and r = 1/p_z the slopes are
+Autograd would keep every intermediate value: about 27 for each ray and evaluation with linear interpolation of the
+index, and 115 with a cubic spline. The derivative written by hand needs only where a ray was and what it met there.
+With p = p0 + δp, n = n0 + Δn, v = p0/p_z0 and r = 1/p_z the slopes are
 
     δy' = r (δp_y − v_y q),    δp_y' = r n ∂n/∂y,    W' = r (B + |δp|² + q²)/2,
     ∫κ ds: r n κ,    τ' = r (p_x ∂n/∂y − p_y ∂n/∂x)/(n + p_z).
 
-q = (p_z² − p_z0²)/(p_z + p_z0), its numerator B − δp·(δp + 2p0) free of cancellation, differs as p_z − p_z0 does.
-No slope depends on the last three, the sums along the ray.
+Here q = (p_z² − p_z0²)/(p_z + p_z0), which equals p_z − p_z0. Its numerator is computed as B − δp·(δp + 2p0), without
+cancellation. W, ∫κ ds and τ are sums along the ray: no slope depends on them.
 """
 
 from dataclasses import dataclass
@@ -21,16 +21,22 @@ from torch import Tensor
 
 from torchdic.specimen.interpolation import SliceSampler
 
-# δy, δx, δp_y, δp_x come first in a state, then the sums.
+# A state begins with the moving components δy, δx, δp_y, δp_x. The sums along the ray follow.
 MOVING = 4
 
 
 @dataclass(frozen=True, eq=False)
 class RayEquation:
-    """The ODE of many rays at once, in a state of δy, δx, δp_y, δp_x, W, ∫κ ds if light is absorbed, τ if `turn`.
+    """The ODE of many rays at once.
 
-    straight: (7, …), the unperturbed rays' y and x on the first face, v_y, v_x, p_y, p_x and p_z. background: n0, 0-d.
-    index, absorption: Δn and κ. face: depth of the first face in µm. Its methods want torch.no_grad().
+    The state holds δy, δx, δp_y, δp_x and W, then ∫κ ds if light is absorbed, then τ if `turn`.
+
+    straight: (7, …), the unperturbed rays' y and x on the plane where they start, v_y, v_x, p_y, p_x and p_z.
+    background: n0, 0-d.
+    index, absorption: samplers of Δn and κ.
+    face: depth in µm of the plane where the rays start.
+    turn: whether τ is computed.
+    Call its methods under torch.no_grad().
     """
 
     straight: Float[Tensor, "7 *ray"]
@@ -42,7 +48,7 @@ class RayEquation:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """All that a solution may be differentiated in: straight, background, slices of Δn, slices of κ."""
+        """All tensors by which a solution may be differentiated: straight, background, slices of Δn, slices of κ."""
         kappa = () if self.absorption is None else self.absorption.slices
         return (self.straight, self.background, *self.index.slices, *kappa)
 
@@ -51,7 +57,7 @@ class RayEquation:
         return _Unperturbed(self.straight[:2], self.straight[2:4], self.straight[4:6], self.straight[6])
 
     def meet(self, z: float, moving: Float[Tensor, "4 *ray"]) -> "Met":
-        """What rays meet at depth z."""
+        """What rays meet at depth z (µm). moving: their δy, δx, δp_y, δp_x."""
         y, x = self._positions(z, moving)
         kappa = None if self.absorption is None else self.absorption.value(z, y, x)
         return self.momenta(moving, self.index.sample(z, y, x), kappa)
@@ -59,7 +65,7 @@ class RayEquation:
     def momenta(
         self, moving: Float[Tensor, "4 *ray"], index: Float[Tensor, "3 *ray"], kappa: Float[Tensor, " *ray"] | None
     ) -> "Met":
-        """As `meet`, of what was sampled before."""
+        """Like `meet`, from samples taken before. index: Δn, ∂n/∂y, ∂n/∂x. kappa: κ, or None."""
         _, _, p0, pz0 = self._unperturbed
         delta, dp = index[0], moving[2:]
         dp_y, dp_x = dp.unbind()
@@ -72,7 +78,7 @@ class RayEquation:
         return Met(moving, dp, index, kappa, delta + self.background, pz, pz.reciprocal(), q, path)
 
     def moves(self, met: "Met", out: Float[Tensor, "4 *ray"] | None = None) -> Float[Tensor, "4 *ray"]:
-        """The slopes of δy, δx, δp_y and δp_x."""
+        """The slopes of δy, δx, δp_y and δp_x, written into `out` if it is given."""
         slopes = torch.empty_like(met.moving) if out is None else out
         of_place, of_momentum = slopes.split(2)
         torch.addcmul(met.dp, self._unperturbed.v, met.q, value=-1, out=of_place).mul_(met.r)
@@ -101,10 +107,12 @@ class RayEquation:
         sampled_bar: Tensor | None = None,
         h: float = 1.0,
     ) -> "Pulled":
-        """The loss's derivatives in what was met at depth z, from those in `moves` and, h times, in the sums.
+        """The loss's derivatives with respect to what was met at depth z.
 
-        A name that ends in _bar is the loss's derivative in that value. moves_bar is overwritten. sampled_bar: in what
-        was sampled, where the loss depends on it in other ways too.
+        A name that ends in _bar is the loss's derivative with respect to that value.
+        moves_bar: of the result of `moves`. It is overwritten.
+        sums_bar: of the sums, to which the slopes contribute h times.
+        sampled_bar: of what was sampled, where the loss depends on it in other ways too.
         """
         _, gy, gx = met.sampled.unbind()
         n, pz, r, q, dp, (_, v, p0, _) = met.n, met.pz, met.r, met.q, met.dp, self._unperturbed
@@ -116,12 +124,12 @@ class RayEquation:
         index_bar = torch.empty_like(met.sampled)
         n_bar = torch.mul(gy, momentum_out[0], out=index_bar[0]).addcmul_(gx, momentum_out[1])
         gradient_bar = torch.mul(n, momentum_out, out=index_bar[1:])
-        # of r, by itself and within p_z: −r² of its own
+        # with respect to r = 1/p_z, whose derivative with respect to p_z is −r²
         y_out, x_out = place_out.unbind()
         r_bar = (n * n_bar).addcmul_(met.path, path_bar, value=0.5).addcmul_(dp[0], y_out).addcmul_(dp[1], x_out)
         drift = (v[0] * y_out).addcmul_(v[1], x_out)
         r_bar.addcmul_(drift, q, value=-1)
-        # of −q and −p_z
+        # with respect to −q and to −p_z
         less_q_bar = drift.addcmul_(q, path_bar, value=-1)
         kappa_bar = None
         if met.kappa is not None:
@@ -178,7 +186,7 @@ class RayEquation:
 
 
 class _Unperturbed(NamedTuple):
-    """The straight rays' (y, x) on the first face, (v_y, v_x), (p_y, p_x) and p_z."""
+    """The straight rays' (y, x) where they start, (v_y, v_x), (p_y, p_x) and p_z."""
 
     place: Tensor
     v: Tensor
@@ -205,9 +213,11 @@ class Met(NamedTuple):
 
 
 class Pulled(NamedTuple):
-    """The loss's derivatives in the moving components, the unperturbed rays, n0, and the planes of Δn and of any κ.
+    """The loss's derivatives with respect to what a slope depends on.
 
-    None where nobody asks.
+    moving, straight, background: those of the moving components, the unperturbed rays and n0.
+    planes: those of the planes of Δn and, if light is absorbed, of κ.
+    A derivative is None if its tensor is not learned.
     """
 
     moving: Tensor

@@ -1,8 +1,8 @@
-"""Bent rays -> a complex field on the grid, at a reference plane inside the specimen.
+"""From bent rays to a complex field on the grid, at a reference plane inside the specimen.
 
-Exit rays are extended straight back, in the background, to a plane where the wavefront is smooth and displacements
-are small. There the mesh of rays is rasterised, triangle by triangle; where it folds, the field is the sum over its
-branches.
+The rays that leave the volume are extended straight back, in the background, to a plane where the wavefront is smooth
+and displacements are small. There the mesh of rays is rasterised, triangle by triangle. Where the mesh folds, the field
+is the sum over its branches.
 """
 
 import math
@@ -20,7 +20,7 @@ from torchdic.rays.mesh import SURROUND, Mesh, Pairs, cross, crossed_caustics
 from torchdic.rays.trace import Deviation, deviation, launch
 from torchdic.specimen.volume import SampledVolume
 
-# Least tube area relative to the unperturbed one: a caustic is bright but finite.
+# Smallest tube area relative to the unperturbed one, which keeps the brightness of a caustic finite.
 LEAST_TUBE = 1e-3
 
 
@@ -36,15 +36,20 @@ def ray_field(
 ) -> Complex[Tensor, "source component y x"]:
     """Each source's envelope at depth `plane` (µm), from rays traced through the volume.
 
-    Inside a triangle of the mesh the OPD is Σ w_i [W_i + ½ δp_i·(X − x_i)] with barycentric weights w_i, third order in
-    the mesh, and the amplitude is √(p_z0/(p_z·|det ∂x_r/∂x0|)), which conserves energy.
+    Inside a triangle of the mesh the OPD is Σ w_i [W_i + ½ δp_i·(X − x_i)] with barycentric weights w_i, which is of
+    third order in the mesh. The amplitude is √(p_z0/(p_z·|det ∂x_r/∂x0|)), which conserves energy.
 
-    wavelength: in vacuum, µm. momentum: n·sinθ (y, x) of each source's direction. polarised: whether rays carry their
-    polarisation. The field then has two components, along +x and +y of each ray's local frame for light that comes in
-    along +x: (cos τ, sin τ) times the envelope (see `torchdic.rays.trace`). Otherwise it has one. slabs: see
-    `deviation`.
-    Raises TurnedRaysError for rays that can't go on toward +z in the volume or behind it, and SidewaysError for rays
-    that come from too far beyond the volume's sides.
+    volume: sampled.
+    wavelength: in vacuum, µm.
+    momentum: n·sinθ (y, x) of each source's direction, (source, 2).
+    plane: depth of the reference plane in µm.
+    fidelity: as for `torchdic.rays.trace.trace`, and its amplitude.
+    polarised: whether rays carry their polarisation. If so, the field has two components, along +x and +y of each ray's
+        local frame: for light that comes in polarised along +x they are (cos τ, sin τ) times the envelope (see
+        `torchdic.rays.trace`). Otherwise the field has one component.
+    slabs: see `deviation`.
+    Raises TurnedRaysError if rays can't go on toward +z in the volume or behind it, and SidewaysError if rays come from
+    too far beyond the volume's sides.
     """
     grid, n0 = volume.grid, volume.background
     tubes = tubes_that_may_fold(volume, momentum)
@@ -76,7 +81,11 @@ def ray_field(
 
 
 def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviation:
-    """Rays carried on in the homogeneous background by `distance` (µm) along z; a negative one takes them back."""
+    """Rays extended in the homogeneous background by `distance` (µm) along z. A negative distance takes them back.
+
+    p0: momentum of the unperturbed rays (…, 2).
+    n0: index of the background.
+    """
     dp, pz0 = rays.momentum, axial_momentum(n0, p0)
     p = p0 + dp
     pz = axial_momentum(n0, p)
@@ -87,7 +96,7 @@ def extend(rays: Deviation, p0: Tensor, n0: Tensor, distance: float) -> Deviatio
 
 
 def tube_area(displacement: Float[Tensor, "source y x 2"], grid: Grid) -> Float[Tensor, "source y x"]:
-    """Det ∂x_r/∂x0, second order in the mesh: a ray tube's signed area over its unperturbed one."""
+    """Det ∂x_r/∂x0, second order in the mesh: the signed area of a ray tube over its unperturbed area."""
     (yy, yx), (xy, xx) = (
         torch.gradient(displacement[..., axis], spacing=grid.spacing[1:], dim=[1, 2]) for axis in (0, 1)
     )
@@ -95,17 +104,17 @@ def tube_area(displacement: Float[Tensor, "source y x 2"], grid: Grid) -> Float[
 
 
 def _tube(landed: Deviation, momentum: Tensor, volume: SampledVolume) -> Tensor:
-    """The cross-section of each ray's tube over its unperturbed one, (source, y, x); its inverse is the intensity."""
+    """The cross-section of each ray's tube over its unperturbed one, (source, y, x). The intensity is its inverse."""
     n0, p0 = volume.background, momentum[:, None, None, :]
     slant = axial_momentum(n0, p0 + landed.momentum) / axial_momentum(n0, p0)
     return tube_area(landed.position, volume.grid) * slant
 
 
 def _caustics_passed(mesh: Mesh, leaving: Deviation, landed: Deviation, tubes: Tubes | None, *, behind: bool) -> Tensor:
-    """Caustics behind each triangle, (source, triangle), negative where light passed them on its way forward.
+    """The phase that caustics add to each triangle, in quarters of a wave, (source, triangle).
 
-    A caustic costs a quarter of a wave where it is passed forward; the way back to the plane gives it back. behind:
-    whether the plane lies behind the volume.
+    Each caustic that light passes forward takes a quarter. Each caustic passed on the way back to the plane adds one.
+    behind: whether the plane lies behind the volume, so that rays go forward to it.
     """
     crossed = crossed_caustics(mesh.edges(leaving.position), mesh.edges(landed.position))
     quarters = -crossed if behind else crossed
@@ -113,9 +122,10 @@ def _caustics_passed(mesh: Mesh, leaving: Deviation, landed: Deviation, tubes: T
 
 
 class _Inside:
-    """Values between a triangle's corners, at each pixel that lies inside it.
+    """Interpolation between a triangle's corners, at each pixel that lies inside it.
 
-    weight: the corners' barycentric weights, (pair, 3). area: of the triangle in µm², (pair,).
+    weight: the corners' barycentric weights, (pair, 3).
+    area: of the triangle in µm², (pair,).
     """
 
     def __init__(self, mesh: Mesh, pairs: Pairs, displacement: Tensor) -> None:
@@ -127,21 +137,21 @@ class _Inside:
         self.weight = opposite / self.area[:, None]
 
     def corners(self, values: Tensor) -> Tensor:
-        """Values (source, y, x, …) of the rays at the corners, (pair, 3, …)."""
+        """The values of the rays at the corners, (pair, 3, …). values: (source, y, x, …)."""
         return self._mesh.flat(values)[self._source, self._vertices]
 
     def slopes(self, momentum: Tensor) -> Tensor:
-        """δp·(X − x) of each corner at x, (pair, 3)."""
+        """δp·(X − x) for each corner at x, (pair, 3)."""
         return (self.corners(momentum) * self._offset).sum(-1)
 
     def mean(self, values: Tensor) -> Tensor:
-        """Values of the rays, linear between the corners, (pair,)."""
+        """The rays' values, interpolated linearly between the corners, (pair,)."""
         return (self.weight * self.corners(values)).sum(-1)
 
     def amplitude(self, tube: Tensor, grid: Grid) -> Tensor:
-        """The inverse root of a tube's cross-section, (pair,)."""
+        """One over the root of a tube's cross-section, (pair,)."""
         flat = self.area / (grid.spacing[1] * grid.spacing[2])
         smooth = self.mean(tube)
-        # beside a fold the interpolated area may vanish or change sign inside a triangle whose own does not
+        # beside a fold the interpolated area may vanish or change sign, although the triangle's own area does not
         smooth = torch.where(smooth / flat > 0.25, smooth, flat)
         return smooth.abs().clamp_min(LEAST_TUBE).rsqrt()

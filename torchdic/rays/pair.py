@@ -1,4 +1,4 @@
-"""The linear pair: how position and momentum of a ray change with its momentum at the start.
+"""The linear pair: how a ray's position and momentum change with its momentum at the start.
 
 With Q = ∂x/∂p_s, P = ∂p/∂p_s, g = n∇⊥n and G = ½∇⊥∇⊥n², Hamilton's variational equations of H = −p_z are
 
@@ -18,13 +18,17 @@ from torchdic.rays.trace import Deviation, Flight, Rays, fly
 from torchdic.specimen.interpolation import SliceSampler, spline_taps
 from torchdic.specimen.volume import SampledVolume
 
-# δy, δx, δp_y, δp_x and W of the ray come first in a state, then the elements of Q and P.
+# A state begins with the ray's δy, δx, δp_y, δp_x and W. The elements of Q and P follow.
 RAY = MOVING + 1
 
 
 @dataclass(frozen=True, eq=False)
 class LinearPair:
-    """A ray at the volume's last face, and the linear pair along it: Q in µm and P, (…, 2, 2), axes (y, x)."""
+    """A ray at the volume's last face, and the linear pair along it.
+
+    ray: its deviation.
+    q, p: Q in µm and P, (…, 2, 2), axes (y, x).
+    """
 
     ray: Deviation
     q: Float[Tensor, "*ray 2 2"]
@@ -32,10 +36,13 @@ class LinearPair:
 
 
 def linear_pair(volume: SampledVolume, rays: Rays, fidelity: Fidelity, start: float) -> LinearPair:
-    """The linear pair at the volume's last face of rays that start at depth `start` (µm).
+    """The linear pair at the volume's last face.
 
-    volume: sampled by a cubic spline, which has second derivatives. Of `fidelity` solver, one of equal steps, steps and
-    memory are read. Raises TurnedRaysError as `deviation` does.
+    volume: sampled by a cubic spline, which has second derivatives.
+    rays: where they start; only position and momentum are used.
+    fidelity: its solver (one of equal steps), steps and memory are used.
+    start: depth in µm at which the rays start.
+    Raises TurnedRaysError as `deviation` does.
     """
     position, momentum = torch.broadcast_tensors(rays.position, rays.momentum)
     flight = _PairFlight(volume, position, momentum, fidelity, start=start)
@@ -49,13 +56,13 @@ class _PairFlight(Flight):
     """Rays on their way through a volume, each with its linear pair."""
 
     def beginning(self) -> Tensor:
-        """Q = 0 and P = I."""
+        """The state at the start: no deviation, Q = 0 and P = I."""
         state = torch.cat((super().beginning(), self.straight.new_zeros(8, *self.straight.shape[1:])))
         state[RAY + 4] = state[RAY + 7] = 1.0
         return state
 
     def advance(self, first: int, last: int, state: Tensor) -> Tensor:
-        """The state behind steps first … last − 1."""
+        """The state after steps first … last − 1."""
         equation, depths = self.equation(first, last)
         index = equation.index
         sampler = _CurvedSampler(index.grid, index.slices, index.interpolation, index.first)

@@ -1,13 +1,13 @@
-"""The ray ODE's solution by torchdiffeq, with a backward pass that keeps what each evaluation sampled.
+"""The solution of the ray ODE by torchdiffeq. Its backward pass uses what each evaluation sampled.
 
-Behind a method of equal steps the backward pass is the method's own adjoint: with stages k_i = f(s_i),
-s_i = y + h Σ_j a_ij k_j and y' = y + h Σ b_i k_i, from the last to the first
+For a method of equal steps the backward pass is the method's own adjoint. The stages are k_i = f(s_i), s_i = y + h Σ_j
+a_ij k_j, and the step's end is y' = y + h Σ b_i k_i. From the last stage to the first
 
-    k̄_i = h (b_i ȳ' + Σ_j>i a_ji s̄_j),    s̄_i = k̄_i ∂f/∂s_i,    ȳ = ȳ' + Σ s̄_i,
+    k̄_i = h (b_i ȳ' + Σ_j>i a_ji s̄_j),    s̄_i = k̄_i ∂f/∂s_i,    ȳ = ȳ' + Σ s̄_i.
 
-the exact derivative of what was computed, without a second look at the volume's values but for the slope of what was
-sampled. (torchdiffeq's odeint_adjoint solves another ODE backward, whose state would hold the volume.) An adaptive
-method's backward pass is autograd's, evaluation by evaluation.
+This is the exact derivative of what was computed. It reads the volume again only for the slope of what was sampled.
+(torchdiffeq's odeint_adjoint solves another ODE backward, whose state would hold the volume.) For an adaptive method
+autograd makes the backward pass, evaluation by evaluation.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ from torchdic.fidelity import ADAPTIVE, Fidelity, Solver
 from torchdic.rays.equation import MOVING, Met, Pulled, RayEquation
 from torchdic.specimen.interpolation import SliceSampler, depth_weights
 
-# torchdiffeq's methods of equal steps, explicit Runge-Kutta (a, b) row by row; its rk4 is the 3/8 rule.
+# torchdiffeq's explicit Runge-Kutta methods of equal steps: the rows of a, then b. Its rk4 is the 3/8 rule.
 TABLEAUX: dict[Solver, tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]] = {
     "euler": (((),), (1,)),
     "midpoint": (((), (1 / 2,)), (0, 1)),
@@ -38,20 +38,23 @@ def solve(
     fidelity: Fidelity,
     watch: Callable[[int, Tensor], None] = lambda *_: None,
 ) -> Float[Tensor, "component *ray"]:
-    """The state at the last of some depths in µm, from the one at the first.
+    """The state at the last of some depths, from the state at the first.
 
-    A method of equal steps takes one from each depth to the next. Depths belong on the CPU: one read from another
-    device would make every stage wait for it. Of `fidelity` solver and tolerance are read. A ray that can't go on
-    toward +z ends as nan. watch: is shown, after each of equal steps, its number from 0
-    and the moving components, without a graph.
+    equation: of the rays.
+    state: at the first depth, (component, …).
+    depths: in µm, on the CPU: each stage would have to wait for a depth from another device. A method of equal steps
+        takes one step from each depth to the next.
+    fidelity: its solver and tolerance are used.
+    watch: called after each equal step with the step's number, from 0, and the moving components, without a graph.
+    A ray that can't go on toward +z ends as nan.
     """
     if fidelity.solver not in ADAPTIVE:
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in (state, *equation.tensors))
         return _EqualSteps.apply(equation, depths, fidelity.solver, keep, watch, state, *equation.tensors)  # pyright: ignore[reportReturnType]
 
-    # torchdiffeq's own norm is a mean over all rays, which lets a few hard ones err among many easy ones; and after an
-    # empty stretch its steps grow so long that they would jump over a specimen or far beyond the volume. Its own choice
-    # of a first step depends on the state, and gradients would run through the depths
+    # torchdiffeq's own norm is a mean over all rays, so a few hard rays may err among many easy ones. After an empty
+    # stretch its steps grow so long that they would jump over a specimen or far beyond the volume. Its own choice of a
+    # first step depends on the state, so that gradients would run through the depths
     slice_ = equation.index.grid.spacing[0]
     options = {"norm": _largest, "first_step": slice_, "max_step": slice_}
     tolerance, method = fidelity.tolerance, fidelity.solver
@@ -66,7 +69,7 @@ def solve(
             options=options,
         )
     except AssertionError:
-        # it gives up where a ray turns; equal steps leave nan there
+        # torchdiffeq gives up where a ray turns; equal steps give nan there
         end = solve(equation, state, depths, replace(fidelity, solver="rk4"))
         if bool(torch.isfinite(end).all()):
             raise
@@ -89,7 +92,7 @@ def equal_steps(
     depths: Float[Tensor, " depth"],
     solver: Solver,
 ) -> Float[Tensor, "component *ray"]:
-    """The state at the last of some depths by a method of `TABLEAUX`, a step from each depth to the next."""
+    """The state at the last of some depths (µm), by a method of `TABLEAUX` with a step from each depth to the next."""
     options = {"grid_constructor": lambda *_: depths}
     return _odeint(slopes, state, depths, method=solver, options=options)
 
@@ -112,12 +115,12 @@ class _EqualSteps(torch.autograd.Function):
 
         def slopes(z: float, state: Tensor) -> Tensor:
             step, stage = divmod(next(evaluations), stages)
-            if stage == 0 and step > 0:  # a step begins where the last one has ended
+            if stage == 0 and step > 0:  # a step begins where the last one ended
                 watch(step - 1, state[:MOVING])
             met = equation.meet(z, state[:MOVING])
             if keep:
                 if stage == 0:
-                    kept.append(met.moving.clone())  # without the sums beside it
+                    kept.append(met.moving.clone())  # a clone, so that the sums beside it are freed
                 kept.extend([met.sampled] if met.kappa is None else [met.sampled, met.kappa])
             return equation.slopes(met)
 
@@ -142,7 +145,7 @@ class _EqualSteps(torch.autograd.Function):
         for h, stages in reversed(_stages(solver, depths)):
             moving, *sampled = kept[-1 - fields * len(b) :]
             del kept[-1 - fields * len(b) :]
-            # the step once more, from what it sampled
+            # compute the step again from what it sampled
             mets: list[Met] = []
             slopes: list[Tensor] = []
             for i, row in enumerate(a):
@@ -151,7 +154,7 @@ class _EqualSteps(torch.autograd.Function):
                 mets.append(equation.momenta(place, index, kappa))
                 if i + 1 < len(b):
                     slopes.append(equation.moves(mets[i]))
-            stage_bars: list[Tensor] = []  # of stages i + 1 …, the last one first
+            stage_bars: list[Tensor] = []  # of stages i + 1, i + 2, …, the last one first
             for i in reversed(range(len(b))):
                 slopes_bar = moving_bar * (h * b[i])
                 for j, stage_bar in zip(reversed(range(i + 1, len(b))), stage_bars, strict=True):
@@ -190,7 +193,7 @@ class _Evaluation(torch.autograd.Function):
 
 
 class _Gradients:
-    """The loss's derivatives in an equation's tensors, summed over its evaluations; None where nobody asks."""
+    """The loss's derivatives by an equation's tensors, summed over its evaluations; None for a tensor not learned."""
 
     def __init__(self, equation: RayEquation) -> None:
         self.bars = [torch.zeros_like(t) if t.requires_grad else None for t in equation.tensors]
@@ -213,7 +216,7 @@ class _Gradients:
 def _stages(solver: Solver, depths: Tensor) -> list[tuple[float, list[float]]]:
     """Each step's length, and the depths of its evaluations."""
     nodes = [sum(row) for row in TABLEAUX[solver][0]]
-    # the end itself, where rounding could lie beyond it: a slab has only its own slices
+    # take the end itself: rounding could give a depth beyond it, and a slab has only its own slices
     return [
         (last - first, [last if c == 1 else first + c * (last - first) for c in nodes])
         for first, last in pairwise(depths.tolist())
@@ -232,9 +235,10 @@ def _advanced(moving: Tensor, slopes: Sequence[Tensor], row: Sequence[float], h:
 
 
 def _maker(equation: RayEquation) -> Callable[[Sequence[Tensor]], tuple[RayEquation, list[Tensor]]]:
-    """What makes the equation anew of its tensors as autograd hands them back, and tells what comes behind them.
+    """A function that makes the equation again from its tensors, as autograd returns them.
 
-    It holds no tensor itself: those of a solution that is computed again would be held until then.
+    It also returns the tensors that follow those of the equation. It holds no tensor itself. Otherwise the tensors of a
+    solution that is computed again would be held until then.
     """
     index, face, turn = equation.index, equation.face, equation.turn
     grid, interpolation, first = index.grid, index.interpolation, index.first
@@ -254,9 +258,9 @@ def _maker(equation: RayEquation) -> Callable[[Sequence[Tensor]], tuple[RayEquat
 
 def _odeint(slopes: Callable[[float, Tensor], Tensor], state: Tensor, depths: Tensor, **options: Any) -> Tensor:
     """Torchdiffeq's solution at the last of some depths."""
-    from torchdiffeq import odeint  # only who traces rays loads it
+    from torchdiffeq import odeint  # loaded only where rays are traced
 
-    ends = depths[[0, -1]].to(state.device)  # odeint takes no times that are on another device
+    ends = depths[[0, -1]].to(state.device)  # odeint needs its times on the state's device
     return torch.as_tensor(odeint(lambda z, s: slopes(float(z), s), state, ends, **options)[-1])
 
 

@@ -1,21 +1,23 @@
 """Rays through a gradient of index: the ray ODE, solved by torchdiffeq.
 
-With z as independent variable and p = n·(transverse direction), p_z = √(n² − |p|²), Fermat's principle reads
+With z as independent variable, p = n·(transverse direction) and p_z = √(n² − |p|²), Fermat's principle reads
 
-    dx/dz = p/p_z,    dp/dz = n ∇⊥n / p_z
+    dx/dz = p/p_z,    dp/dz = n ∇⊥n / p_z.
 
-(the Hamiltonian form of Kagalwala & Kanade's Eq. 7; their printed Eq. 9 has misprints). Only the deviation from the
-unperturbed ray, straight in the background, is integrated, and the optical path only as its difference W from the
-unperturbed plane wave: the absolute ones would lose the phase to rounding. With δp = p − p0, δx = x − x_straight,
-B = n² − n0² and q = p_z − p_z0 = (B − δp·(p + p0))/(p_z + p_z0):
+This is the Hamiltonian form of Kagalwala & Kanade's Eq. 7; their printed Eq. 9 has misprints. Only differences are
+integrated: the deviation from the unperturbed ray, which is straight in the background, and the difference W of the
+optical path from that of the unperturbed plane wave. Rounding of the absolute values would lose the phase. With δp = p
+− p0, δx = x − x_straight, B = n² − n0² and q = p_z − p_z0 = (B − δp·(p + p0))/(p_z + p_z0):
 
     dδx/dz = (δp − q p0/p_z0)/p_z,    dW/dz = (B + |δp|² + q²)/(2 p_z).
 
-The transverse electric field E is carried parallel to itself along a ray, E' = −(E·t')t for the direction t (Rytov's
-law). Seen in the frame got from (x, y, z) by the shortest turn of z to t, it turns by τ from +x towards +y: directions
-sweep the solid angle dτ = (1 − cosθ)dφ about z, which is
+The transverse electric field E is carried parallel to itself along a ray of direction t: E' = −(E·t')t (Rytov's law).
+The ray's local frame is (x, y, z) after the shortest turn from z to t. In this frame E turns by τ from +x towards +y,
+because the direction sweeps the solid angle dτ = (1 − cosθ)dφ about z:
 
-    dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)),    without the singularity of s and p on the axis.
+    dτ/dz = (p_x n_y − p_y n_x)/(p_z (n + p_z)).
+
+This has no singularity on the axis, where the directions s and p are undefined.
 """
 
 import math
@@ -44,10 +46,12 @@ from torchdic.specimen.volume import SampledVolume, Volume
 class Rays:
     """Rays that cross one plane of constant z.
 
-    position: (…, 2) in µm. momentum: (…, 2), n·(transverse direction). opd: (…) in µm, the difference from each ray's
-    own unperturbed plane wave. absorbed: (…), ∫κ ds in µm along the ray, or None where nothing absorbs. turn: (…), τ
-    in rad, how far the electric field has turned from +x towards +y in the frame local to the ray (the module's head),
-    or None where no one asks.
+    position: (…, 2), (y, x) in µm.
+    momentum: (…, 2), n·(transverse direction), (y, x).
+    opd: (…) in µm, the difference from each ray's own unperturbed plane wave.
+    absorbed: (…), ∫κ ds in µm along the ray. None if nothing absorbs.
+    turn: (…), τ in rad, the angle by which the electric field has turned from +x towards +y in the ray's local frame
+        (see the module's docstring). None if it is not wanted.
     """
 
     position: Float[Tensor, "*ray 2"]
@@ -59,7 +63,14 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Deviation:
-    """How rays differ from their unperturbed selves at one plane: δx, δp (…, 2), W (…), ∫κ ds and τ (…) or None."""
+    """How rays differ from their unperturbed selves on one plane.
+
+    position: δx, (…, 2), (y, x) in µm.
+    momentum: δp, (…, 2), (y, x).
+    opd: W, (…) in µm.
+    absorbed: ∫κ ds, (…) in µm. None if nothing absorbs.
+    turn: τ, (…) in rad. None if it is not wanted.
+    """
 
     position: Tensor
     momentum: Tensor
@@ -73,7 +84,11 @@ def launch(
 ) -> Rays:
     """A plane wave per source as rays on the volume's first face, position (source, y, x, 2).
 
-    Unperturbed, they would cross `plane` (µm) at the voxel centres, continued by `margin` rows and columns a side.
+    grid: of the volume.
+    momentum: n·sinθ (y, x) of each source's direction, (source, 2).
+    background: index of the medium, 0-d.
+    plane: depth in µm at which the unperturbed rays cross the voxel centres.
+    margin: further rows and columns of rays on each side.
     """
     wide = grid.widened(margin, margin)
     y, x = (wide.coordinates(axis, dtype=momentum.dtype, device=momentum.device) for axis in (1, 2))
@@ -87,10 +102,12 @@ def launch(
 def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     """Rays from the volume's first face, z = −nz·dz/2, to its last, z = +nz·dz/2.
 
-    Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (its momentum at the start, in the
-    background), and their `turn`, if they have one, by τ. Of `fidelity` solver, tolerance, steps, interpolation and
-    memory are read. Raises TurnedRaysError where a ray can't go on toward +z: the index falls to its transverse
-    momentum.
+    volume: the specimen.
+    rays: on the first face.
+    fidelity: its solver, tolerance, steps, interpolation and memory are used.
+    Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (with its momentum at the start,
+    in the background). Their `turn`, if they have one, grows by τ. Raises TurnedRaysError if a ray can't go on toward
+    +z, because the index falls to its transverse momentum.
     """
     change = deviation(volume.sampled(fidelity.interpolation), rays, fidelity, turn=rays.turn is not None)
     slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
@@ -118,10 +135,13 @@ def deviation(
 ) -> Deviation:
     """How rays deviate from their unperturbed selves at the volume's last face; see `trace`.
 
-    start: depth in µm of the plane in which the rays start; None is the first face. turn: whether to find τ too.
-    watch: is called with (δy, δx, δp_y, δp_x), shape (4, …) and without a graph, after each step or, by an adaptive
-    solver, at the slices' faces. slabs: whether steps are computed again in the backward pass, slab by slab; None is
-    where they would keep more than `fidelity.memory`.
+    volume: sampled.
+    start: depth in µm of the plane on which the rays start. None is the first face.
+    turn: whether to compute τ too.
+    watch: called with (δy, δx, δp_y, δp_x), shape (4, …), without a graph. It is called after each equal step, or, by
+        an adaptive solver, at the slices' faces.
+    slabs: whether the backward pass computes the steps again, slab by slab. None does so if the steps would keep more
+        than `fidelity.memory`.
     """
     position, momentum = torch.broadcast_tensors(rays.position, rays.momentum)
     flight = Flight(volume, position, momentum, fidelity, start=start, turn=turn, watch=watch)
@@ -131,8 +151,9 @@ def deviation(
 class Flight:
     """Rays on their way from a plane in a volume to its last face, step by step, in the state of `RayEquation`.
 
-    steps: equal ones, or the stretches after each of which an adaptive solver is looked at.
-    shape: of the rays. straight: the unperturbed rays, see `RayEquation`.
+    steps: number of equal steps, or of stretches that an adaptive solver crosses one by one.
+    shape: of the rays.
+    straight: the unperturbed rays, see `RayEquation`.
     """
 
     def __init__(
@@ -152,12 +173,12 @@ class Flight:
         self.equal_steps = fidelity.solver not in ADAPTIVE
         self._start = -face if start is None else start
         self._watch, self._watched = watch, 0
-        # y and x apart: the solution is spent on sums over pairs otherwise
+        # y and x in separate rows: sums over pairs (y, x) would take most of the time otherwise
         place, p = position.movedim(-1, 0), momentum.movedim(-1, 0)
         pz = axial_momentum(volume.background, momentum)
         straight = torch.cat((place, p / pz, p, pz[None]))
         self.shape = straight.shape[1:]
-        # laid out for the CPU's threads until the end
+        # divided among the CPU's threads until the end
         self.straight = straight.reshape(7, shares(grid, pz.numel(), straight.device), -1)
         whole = (fidelity.steps if self.equal_steps else None) or grid.shape[0]
         # a plane one rounding error above a step's end must not cost another step
@@ -173,12 +194,12 @@ class Flight:
         return self.steps > 1 and is_learned((self.straight, self.volume.background, self.volume.fields))
 
     def beginning(self) -> Float[Tensor, "component *ray"]:
-        """The state of rays that do not deviate yet."""
+        """The state of rays at their start: no deviation."""
         components = MOVING + len(self.volume.fields) + self._turn
         return self.straight.new_zeros(components, *self.straight.shape[1:])
 
     def cross(self, first: int, last: int, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
-        """The state behind steps first … last − 1."""
+        """The state after steps first … last − 1."""
         if self._watch is None or self.equal_steps:
             return self.advance(first, last, state)
         for step in range(first, last):
@@ -187,12 +208,12 @@ class Flight:
         return state
 
     def advance(self, first: int, last: int, state: Float[Tensor, "component *ray"]) -> Float[Tensor, "component *ray"]:
-        """As `cross`, in one go."""
+        """Like `cross`, in one call of the solver."""
         equation, depths = self.equation(first, last)
         return solve(equation, state, depths, self.fidelity, lambda step, moving: self._show(first + step, moving))
 
     def equation(self, first: int, last: int) -> tuple[RayEquation, Float[Tensor, " depth"]]:
-        """The equation in steps first … last − 1, which holds their slices alone, and the depths of their ends."""
+        """The equation of steps first … last − 1, with only the slices that they need, and the depths of their ends."""
         depths = self._depths[first : last + 1]
         # an adaptive solver looks beyond the end of its last step
         seen = depths if self.equal_steps else self._depths
@@ -201,7 +222,7 @@ class Flight:
         return RayEquation(self.straight, self.volume.background, index, kappa, self._start, self._turn), depths
 
     def deviation(self, state: Float[Tensor, "component *ray"]) -> Deviation:
-        """What a state at the last face says. Raises TurnedRaysError where rays have stopped on their way."""
+        """The deviation in a state at the last face. Raises TurnedRaysError if rays have stopped on their way."""
         state = state.reshape(len(state), *self.shape)
         stopped = ~torch.isfinite(state[MOVING])
         if bool(stopped.any()):
@@ -215,7 +236,7 @@ class Flight:
         )
 
     def _show(self, step: int, moving: Tensor) -> None:
-        if self._watch is not None and step == self._watched:  # and not when the step is computed again
+        if self._watch is not None and step == self._watched:  # not when the step is computed again
             self._watch(moving.reshape(-1, *self.shape))
             self._watched += 1
 
@@ -223,8 +244,9 @@ class Flight:
 def fly(flight: Flight, budget: int, slabs: bool | None = None) -> Float[Tensor, "component *ray"]:
     """The state of rays at the last face.
 
-    slabs: whether steps are computed again in the backward pass, slab by slab; None is where they would keep more than
-    the budget in bytes.
+    budget: in bytes.
+    slabs: whether the backward pass computes the steps again, slab by slab. None does so if the steps would keep more
+        than the budget.
     """
     state = flight.beginning()
     if slabs is None:

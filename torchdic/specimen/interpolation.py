@@ -1,7 +1,7 @@
 """Values and transverse gradients between voxel centres, one slice at a time.
 
-All rays of a source are at the same depth, so a 3-D interpolation is a 2-D one in the slice blended for that depth, and
-its backward pass touches two (linear) or four (cubic) slices instead of the whole volume.
+All rays of a source are at the same depth. A 3-D interpolation is therefore a 2-D one in the slice blended for that
+depth, and its backward pass touches two (linear) or four (cubic) slices instead of the whole volume.
 
 Outside the outermost voxel centres a field is constant, so its gradient there is 0.
 """
@@ -23,8 +23,11 @@ Interpolation = Literal["linear", "cubic"]
 class SliceSampler:
     """Samples a field of voxels at one depth and many transverse positions.
 
-    grid: of the whole field. slices: the field's 2-D slices first … first + len(slices) − 1, or, for "cubic", those of
-    its spline coefficients (see `spline_coefficients`).
+    grid: of the whole field.
+    slices: the field's 2-D slices first … first + len(slices) − 1. For "cubic" those of its spline coefficients (see
+        `spline_coefficients`).
+    interpolation: "linear" or "cubic".
+    first: index of the first slice.
     """
 
     def __init__(
@@ -50,7 +53,7 @@ class SliceSampler:
         return self.value_plane(self.plane(z), y, x)
 
     def plane(self, z: float) -> Float[Tensor, "y x"]:
-        """The slice blended for depth z; of spline coefficients for "cubic"."""
+        """The slice blended for depth z (µm). For "cubic" it holds spline coefficients."""
         weights = depth_weights(self.grid, z, self.interpolation)
         (first, weight), *others = weights.items()
         field = self.slices[first - self.first] * weight
@@ -61,7 +64,7 @@ class SliceSampler:
     def sample_plane(
         self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
     ) -> Float[Tensor, "3 *ray"]:
-        """As `sample`, of a slice that `plane` blended."""
+        """Like `sample`, in a slice that `plane` blended."""
         if self.interpolation == "cubic":
             (dy, dx), (value, slope_y, slope_x) = self.grid.spacing[1:], _sample_cubic(field, *self._indices(y, x))
             return torch.stack((value, slope_y / dy, slope_x / dx))
@@ -70,7 +73,7 @@ class SliceSampler:
     def value_plane(
         self, field: Float[Tensor, "y x"], y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"]
     ) -> Float[Tensor, " *ray"]:
-        """As `value`, of a slice that `plane` blended."""
+        """Like `value`, in a slice that `plane` blended."""
         if self.interpolation == "cubic":
             return _sample_cubic(field, *self._indices(y, x))[0]
         return _grid_sample(_thick(field[None]), self._where(y, x)).reshape(y.shape)
@@ -78,16 +81,17 @@ class SliceSampler:
     def pull_back(
         self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"], sampled_bar: Float[Tensor, "3 *ray"]
     ) -> tuple[Float[Tensor, "2 *ray"], Float[Tensor, "y x"] | None]:
-        """A loss's derivatives in (y, x) and in the plane at depth z, from those in what `sample` gave.
+        """The loss's derivatives with respect to (y, x), and with respect to the plane at depth z.
 
-        Builds no graph. None in place of the plane's where no slice requires grad.
+        sampled_bar: those with respect to the result of `sample`.
+        Builds no graph. The plane's derivative is None if no slice requires grad.
         """
         learned = any(s.requires_grad for s in self.slices)
         with torch.no_grad():
             if self.interpolation == "cubic":
                 return _by_autograd(self.sample_plane, self.plane(z), y, x, sampled_bar, learned)
             channels, where = self._channels(z), self._where(y, x, ring=1)
-            # what autograd would call, without a second forward pass
+            # the function that autograd would call, without a second forward pass
             shared, (share, _, rays, _) = _shared(channels, where), where.shape
             shared_bar, where_bar = torch.ops.aten.grid_sampler_2d_backward(
                 sampled_bar.reshape(3, share, 1, rays).transpose(0, 1), shared, where, 0, 1, True, [learned, True]
@@ -102,7 +106,7 @@ class SliceSampler:
     def pull_back_value(
         self, z: float, y: Float[Tensor, " *ray"], x: Float[Tensor, " *ray"], value_bar: Float[Tensor, " *ray"]
     ) -> tuple[Float[Tensor, "2 *ray"], Float[Tensor, "y x"] | None]:
-        """As `pull_back`, for `value`."""
+        """Like `pull_back`, for `value`."""
         learned = any(s.requires_grad for s in self.slices)
         with torch.no_grad():
             return _by_autograd(self.value_plane, self.plane(z), y, x, value_bar, learned)
@@ -114,9 +118,9 @@ class SliceSampler:
         """`_with_slopes` of the slice blended for depth z."""
         if torch.is_grad_enabled():
             return self._with_slopes(self.plane(z))
-        if self._blended is not None and self._blended[0] == z:  # a step begins where another has ended
+        if self._blended is not None and self._blended[0] == z:  # a step begins where another one ended
             return self._blended[1]
-        # the slopes of a blend are the blend of the slopes: those of a slice serve as long as rays are beside it
+        # the slopes of a blend are the blend of the slopes, so those of a slice are kept while rays are beside it
         weights = depth_weights(self.grid, z, "linear")
         known = self._around
         self._around = {i: known[i] if i in known else self._with_slopes(self.slices[i - self.first]) for i in weights}
@@ -125,7 +129,7 @@ class SliceSampler:
         return self._blended[1]
 
     def _with_slopes(self, field: Float[Tensor, "y x"]) -> Float[Tensor, "3 yy xx"]:
-        """A field and its central differences, on one ring of voxels more."""
+        """A field and its central differences along y and x, with one more ring of voxels."""
         dy, dx = self.grid.spacing[1:]
         # Two rings of edge values: the central differences fall to 0 within one voxel beyond the edge.
         padded = F.pad(field[None], (2, 2, 2, 2), mode="replicate")[0]
@@ -151,14 +155,14 @@ class SliceSampler:
         return field_bar
 
     def _scales(self, ring: int = 0) -> tuple[float, float]:
-        """What makes grid_sample's coordinates of y and x in µm: −1 … 1 from the first voxel to the last."""
+        """Factors from µm to grid_sample's coordinates of y and x, −1 at the first voxel and 1 at the last."""
         (ny, nx), (dy, dx) = self.grid.shape[1:], self.grid.spacing[1:]
         return 2 / (dy * (max(ny + 2 * ring, 2) - 1)), 2 / (dx * (max(nx + 2 * ring, 2) - 1))
 
     def _where(self, y: Tensor, x: Tensor, ring: int = 0) -> Float[Tensor, "share 1 ray 2"]:
-        """Positions in µm as grid_sample's coordinates (x, y), on a field with `ring` voxels more on each side."""
+        """Positions in µm as grid_sample's coordinates (x, y), on a field with `ring` more voxels on each side."""
         scale_y, scale_x = self._scales(ring)
-        # x and y apart in memory, as the kernel likes them best
+        # x and y in separate rows of memory, which is fastest for the kernel
         if torch.is_grad_enabled():
             where = torch.stack((x * scale_x, y * scale_y))
         else:
@@ -173,7 +177,7 @@ class SliceSampler:
 
 
 def _thick(channels: Float[Tensor, "c y x"]) -> Float[Tensor, "c yy xx"]:
-    """Channels at least two voxels wide: grid_sample's coordinates, −1 … 1, need two points to stand on."""
+    """Channels at least two voxels wide: between −1 and 1 grid_sample's coordinates need two points."""
     for axis in (1, 2):
         if channels.shape[axis] == 1:
             channels = channels.repeat_interleave(2, axis)
@@ -194,7 +198,7 @@ def _shared(channels: Float[Tensor, "c y x"], where: Float[Tensor, "share 1 ray 
 def _by_autograd(
     sample: Callable[..., Tensor], plane: Tensor, y: Tensor, x: Tensor, sampled_bar: Tensor, learned: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """A loss's derivatives in (y, x) and, if learned, the plane, from those in sample(plane, y, x)."""
+    """The loss's derivatives by (y, x) and, if learned, by the plane, from those by sample(plane, y, x)."""
     inputs = [v.detach().requires_grad_() for v in ((y, x, plane) if learned else (y, x))]
     with torch.enable_grad():
         sampled = sample(inputs[2] if learned else plane, inputs[0], inputs[1])
@@ -203,10 +207,10 @@ def _by_autograd(
 
 
 def shares(grid: Grid, rays: int, device: torch.device) -> int:
-    """How many equal parts `SliceSampler` makes of that many rays: grid_sample gives each to a thread of the CPU.
+    """The number of equal parts that `SliceSampler` makes of that many rays.
 
-    Rays of shape (share, ray) are divided without a copy. A part adds up the slice's gradient by itself, so it has a
-    quarter as many rays as the slice has voxels, or more.
+    grid_sample gives each part to a thread of the CPU. Rays of shape (share, ray) are divided without a copy. Each part
+    adds up the slice's gradient by itself, so a part has at least a quarter as many rays as the slice has voxels.
     """
     if device.type != "cpu":
         return 1
@@ -216,7 +220,7 @@ def shares(grid: Grid, rays: int, device: torch.device) -> int:
 
 
 def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[int, float]:
-    """The slices that the field at depth z depends on, with their weights."""
+    """The slices on which the field at depth z (µm) depends, with their weights."""
     last = grid.shape[0] - 1
     index = min(max(grid.index(0, z), 0.0), float(last))
     base = min(int(index), max(last - 1, 0))
@@ -234,7 +238,7 @@ def depth_weights(grid: Grid, z: float, interpolation: Interpolation) -> dict[in
 
 
 def spline_coefficients(field: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-    """Coefficients of the cubic B-spline (C²) that passes through a field's voxel centres, mirrored at its ends."""
+    """Coefficients of the cubic B-spline (C²) through a field's voxels. The field is mirrored at its ends."""
     for axis in range(3):
         n = field.shape[axis]
         if n == 1:
@@ -259,7 +263,7 @@ def _bspline(t: float) -> tuple[float, float, float, float]:
 
 
 def _sample_cubic(coefficients: Tensor, iy: Tensor, ix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """A spline and its derivatives at fractional indices."""
+    """A spline and its derivatives along y and x at fractional indices."""
     rows, wy, sy = spline_taps(iy, coefficients.shape[0])
     columns, wx, sx = spline_taps(ix, coefficients.shape[1])
     flat = rows[..., :, None] * coefficients.shape[1] + columns[..., None, :]
@@ -273,7 +277,7 @@ def spline_taps(index: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """The four neighbours of a fractional index along an axis of n, with their weights and slopes."""
     # clamp's gradient is 0 outside, and so is the mirrored spline's slope at its ends
     along = index.clamp(0, n - 1)
-    # a ray that can't go on is nan, which no index can be: its weights stay nan
+    # a ray that can't go on is nan: it reads at index 0, and its weights stay nan
     base = along.detach().floor().clamp(max=max(n - 2, 0)).nan_to_num()
     t = along - base
     weights = torch.stack(((1 - t) ** 3, 4 + t * t * (3 * t - 6), 1 + 3 * t * (1 + t - t * t), t**3), -1) / 6

@@ -15,11 +15,12 @@ from torchdic.specimen.interpolation import Interpolation, SliceSampler, spline_
 class Volume(nn.Module):
     """A transparent specimen of index n = background + delta on a grid of voxels.
 
-    grid: where the voxels are. delta: Δn, shape (z, y, x); an nn.Parameter is learned, any other tensor keeps its
-    graph, and its dtype and device are those of everything computed from the volume. background: index of the medium
-    around the specimen, a number or a 0-d tensor. absorption: κ ≥ 0 of the complex index n + iκ, shape (z, y, x), or
-    None for a specimen that absorbs nothing.
-    Raises ValueError where a shape is not the grid's, an index is not a positive number, or κ is negative.
+    grid: where the voxels are.
+    delta: Δn, shape (z, y, x). An nn.Parameter is learned, any other tensor keeps its graph. Everything computed from
+        the volume has the dtype and device of delta.
+    background: index of the medium around the specimen, a number or a 0-d tensor.
+    absorption: κ ≥ 0 of the complex index n + iκ, shape (z, y, x). None is a specimen that absorbs nothing.
+    Raises ValueError if a shape is not the grid's, an index is not a positive number, or κ is negative.
     """
 
     delta: Float[Tensor, "z y x"]
@@ -57,14 +58,14 @@ class Volume(nn.Module):
             self.register_buffer(name, value)
 
     def sampled(self, interpolation: Interpolation) -> "SampledVolume":
-        """The volume made ready to be sampled between its voxel centres."""
+        """The volume prepared for sampling between its voxel centres."""
         fields = [self.delta] if self.absorption is None else [self.delta, self.absorption]
         if interpolation == "cubic":
             fields = [spline_coefficients(f) for f in fields]
         return SampledVolume(self.grid, self.background, tuple(f.unbind(0) for f in fields), interpolation)
 
     def padded(self, margin: int) -> "Volume":
-        """The volume with `margin` voxels of the medium more on each side along y and x."""
+        """The volume with `margin` more voxels of the medium on each side along y and x."""
         if margin == 0:
             return self
         delta, absorption = (None if f is None else F.pad(f, (margin,) * 4) for f in (self.delta, self.absorption))
@@ -72,9 +73,9 @@ class Volume(nn.Module):
         return Volume(self.grid.widened(margin, margin), delta, self.background, absorption)
 
     def mean_plane(self) -> float:
-        """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 where Δn is 0 everywhere.
+        """The |Δn|-weighted mean depth in µm, rounded to the nearest slice centre or face; 0 if Δn is 0 everywhere.
 
-        Faces count too: a specimen centred between two slices would be out of focus by half a slice otherwise.
+        Faces count too. Otherwise a specimen centred between two slices would be out of focus by half a slice.
         """
         weight = self.delta.detach().abs().sum((1, 2), dtype=torch.float64)
         total = float(weight.sum())
@@ -89,8 +90,11 @@ class Volume(nn.Module):
 class SampledVolume:
     """A volume whose Δn and κ can be sampled between voxel centres. It is made once and serves every batch of sources.
 
-    grid: where the voxels are. background: index of the medium, 0-d. fields: the slices (y, x) of Δn, and those of κ
-    where the volume absorbs: the voxels themselves for "linear", a spline's coefficients for "cubic".
+    grid: where the voxels are.
+    background: index of the medium, 0-d.
+    fields: the slices (y, x) of Δn, then those of κ if the volume absorbs. They are the voxels themselves for "linear",
+        and spline coefficients for "cubic".
+    interpolation: "linear" or "cubic".
     """
 
     grid: Grid
@@ -104,7 +108,7 @@ class SampledVolume:
         return len(self.fields) > 1
 
     def samplers(self, between: tuple[float, float] | None = None) -> list[SliceSampler]:
-        """A sampler of each field. between: two depths in µm; only the slices that they depend on are held then."""
+        """A sampler of each field. between: two depths in µm; the samplers then hold only the slices needed there."""
         near = slice(0, None) if between is None else window(self.grid, *between, self.interpolation)
         return [SliceSampler(self.grid, slices[near], self.interpolation, near.start) for slices in self.fields]
 
