@@ -4,8 +4,10 @@ A distant tensor is computed with on the CPU and claims to be elsewhere. As on a
 but for 0-d ones of the CPU, and whoever reads a value, or copies one there, waits for all that was asked for before.
 """
 
-import traceback
+import os
+import sys
 from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,11 +15,10 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 # every build of torch knows it, and autograd looks for no streams there
 DISTANT = torch.device("meta")
-AUTHORS = {str(Path(__file__).parents[1] / name) for name in ("torchdic", "recon")}
+AUTHORS = tuple(f"{Path(__file__).parents[1] / name}{os.sep}" for name in ("torchdic", "recon"))
 # a size or a value that only the device knows, and the CPU asks for
 READERS = {"_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2"}
 MAKERS = (torch.tensor, torch.as_tensor, torch.Tensor.new_tensor)
@@ -69,9 +70,10 @@ class Device:
 
     def wait(self, what: str) -> None:
         """Count one, and whose it is."""
-        frames = (f for f in reversed(traceback.extract_stack()) if AUTHORS & set(map(str, Path(f.filename).parents)))
-        frame = next(frames, None)
-        place = f"{Path(frame.filename).stem}.{frame.name}" if frame else "the caller"
+        frame = sys._getframe()
+        while frame is not None and not frame.f_code.co_filename.startswith(AUTHORS):
+            frame = frame.f_back
+        place = f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}" if frame else "the caller"
         self.waits[f"{what} in {place}"] += 1
 
 
@@ -103,7 +105,7 @@ class _Kernels(TorchDispatchMode):
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
         name = func._schema.name.removeprefix("aten::")
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        tensors = [leaf for leaf in _leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         distant = [t for t in tensors if isinstance(t, Distant)]
         asked = kwargs.get("device")
         to_distant = bool(distant) if asked is None else torch.device(asked) == DISTANT
@@ -124,10 +126,10 @@ class _Kernels(TorchDispatchMode):
                 return leaf
             return ours[id(leaf)] if id(leaf) in ours else Distant(leaf)
 
-        held_args, held_kwargs = tree_map(_held, (args, kwargs))
+        held_args, held_kwargs = _mapped(_held, (args, kwargs))
         if distant:  # and not a number, whose conjugate is asked for too
             func = NOT_LAZY.get(func, func)
-        return tree_map(wrapped, func(*held_args, **held_kwargs))
+        return _mapped(wrapped, func(*held_args, **held_kwargs))
 
 
 def _counts(name: str, args: tuple, kwargs: dict) -> bool:
@@ -135,6 +137,25 @@ def _counts(name: str, args: tuple, kwargs: dict) -> bool:
     if name == "repeat_interleave":
         return kwargs.get("output_size") is None
     return name == "index" and any(isinstance(i, Tensor) and i.dtype == torch.bool for i in args[1])
+
+
+# torch's own trees know far more kinds of containers, and take longer than the kernels
+def _leaves(tree: object) -> Iterator[object]:
+    if isinstance(tree, tuple | list):
+        for branch in tree:
+            yield from _leaves(branch)
+    elif isinstance(tree, dict):
+        yield from _leaves(tuple(tree.values()))
+    else:
+        yield tree
+
+
+def _mapped(function: Callable[[object], object], tree: object) -> object:
+    if isinstance(tree, tuple | list):
+        return type(tree)([_mapped(function, branch) for branch in tree])
+    if isinstance(tree, dict):
+        return {key: _mapped(function, branch) for key, branch in tree.items()}
+    return function(tree)
 
 
 def _held(leaf: object) -> object:

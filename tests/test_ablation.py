@@ -121,7 +121,6 @@ def test_own_defocus_is_half_because_the_map_sees_the_specimen_behind_the_plane_
     torch.testing.assert_close(once, torch.tensor(ablation.whole(scene, 120, linear(STRAIGHT))), rtol=1e-3, atol=0)
 
 
-@pytest.mark.slow
 def test_own_defocus_counts_twice_what_the_amplitude_does(ablation, errors):
     """Rays with their amplitude err by 0.002; with the defocus besides, by 0.010 in focus and up to 0.036 out of it."""
     twice = torch.tensor(ablation.own_defocus(ablation.smooth_ball(), 120, RAYS, "linear"))

@@ -22,8 +22,8 @@ FIDELITIES = {
     "wave-recomputed": Fidelity("wave", steps=5, memory=1),
 }
 PARAMETERS = ("delta", "absorption", "background", "shear", "bias", "focus", "aberrations")
-# the others act on the field, whatever brought it
-CROSSING = ("delta", "absorption", "background")
+# these cross the specimen too; the further parameters act on the field, whatever brought it
+OTHERS = {(w, n) for w in ("projection-cubic-recomputed", "wave-recomputed") for n in ("absorption", "background")}
 PROPAGATIONS = ("projection", "rays", "wave")
 
 
@@ -83,7 +83,7 @@ def step(name, fidelity):
             name,
             fidelity,
             id=f"{name}-{way}",
-            marks=() if way in PROPAGATIONS or name in CROSSING else pytest.mark.slow,
+            marks=() if way in PROPAGATIONS or name == "delta" or (way, name) in OTHERS else pytest.mark.slow,
         )
         for name in PARAMETERS
         for way, fidelity in FIDELITIES.items()
