@@ -404,7 +404,7 @@ def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkey
 
 
 @pytest.mark.parametrize(
-    "room", [(2000, "15 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
+    "room", [(2000, "4 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
 )
 @pytest.mark.parametrize("start", ["linear", "zero"])
 @pytest.mark.usefixtures("no_pictures")

@@ -128,7 +128,9 @@ def test_every_microscope_images_there_as_here(values, name, propagation):
     as_here(values, SCOPES[name], replace(FIDELITY, propagation=propagation))
 
 
-@pytest.mark.parametrize("name", FIDELITIES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow if n == "rays, recomputed" else ()) for n in FIDELITIES]
+)
 def test_every_fidelity_images_there_as_here(values, name):
     as_here(values, SCOPES["plain"], replace(FIDELITY, propagation=name.split(",")[0], **FIDELITIES[name]))
 

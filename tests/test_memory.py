@@ -62,8 +62,14 @@ SCENES = {
 # kept whole, in batches, and a single source's steps in slabs
 BUDGETS = {"whole": AMPLE, "batches": 2_500_000, "least": 1}
 USUAL = ("projection", "wave-2")
+DEAR = ("rays-cubic", "rays-absorbing", "rays-double", "rays-padded", "projection-map")
 CASES = [
-    pytest.param(*scene, budget, id=f"{name}-{kind}", marks=() if name in USUAL or kind == few else pytest.mark.slow)
+    pytest.param(
+        *scene,
+        budget,
+        id=f"{name}-{kind}",
+        marks=() if name in USUAL or (kind == few and name not in DEAR) else pytest.mark.slow,
+    )
     for (name, scene), few in zip(SCENES.items(), cycle(BUDGETS), strict=False)
     for kind, budget in BUDGETS.items()
 ]
@@ -158,7 +164,7 @@ def test_a_learned_background_of_a_field_is_foreseen(monkeypatch):
 
 def test_steps_that_an_adaptive_solver_ignores_change_no_estimate(specimen):
     few, many = (
-        foreseen(specimen(learned=True), SCOPE, ACQUISITION, Fidelity("rays", solver="dopri5", steps=steps))
+        foreseen(specimen(), SCOPE, ACQUISITION, Fidelity("rays", solver="dopri5", steps=steps))
         for steps in (None, 100)
     )
     assert few == many

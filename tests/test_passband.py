@@ -156,9 +156,11 @@ def test_fields_are_as_small_as_their_intensities_allow(monkeypatch):
     """A quarter of the voxels' size asks for a sixteenth of the pixels: no transform is larger than that."""
     sizes = []
     back = torch.fft.ifft2
-    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"])) or back(a, **k))
     grid = Grid((1, 160, 160), (1.0, 0.04, 0.04))
-    image_field(torch.ones(160, 160, dtype=torch.complex128), grid, MICROSCOPES["plain"], Acquisition(), background=N0)
+    scene = torch.ones(160, 160, dtype=torch.complex128), grid, MICROSCOPES["plain"], Acquisition()
+    image_field(*scene, background=N0)  # whose memory has been measured then
+    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"])) or back(a, **k))
+    image_field(*scene, background=N0)
     # 2·8.79 bins across the pupil: 18, whose differences are 35
     assert sizes == [(35, 35)]
 

@@ -21,7 +21,7 @@ from recon.run.reconstruct import prepare_folder
 from torchdic import STANDARD, Fidelity, Volume, image, plan
 from torchdic.files.stack import write_stack
 from torchdic.files.whole import write_json, write_text
-from torchdic.forward.foresee import allot
+from torchdic.forward.foresee import check_fits
 
 
 def run(options: argparse.Namespace) -> None:
@@ -49,7 +49,7 @@ def _by_a_propagation(config: Config, specimen: Any, out: Path, device: torch.de
     volume = voxels(specimen, config.volume.grid, device)
     fidelity = config.fidelity or STANDARD
     if config.tolerance is None:
-        allot(volume, config.microscope, config.acquisition, fidelity)  # refuses before the folder is made
+        check_fits(volume, config.microscope, config.acquisition, fidelity)  # before the folder is made
         prepare_folder(out)
     else:
         prepare_folder(out)

@@ -61,25 +61,25 @@ def foreseen(
         return room.foreseen(fidelity.memory)
 
 
+def check_fits(volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity) -> None:
+    """Raise ShortOfMemoryError if an image needs more memory than is free, however its sources are computed.
+
+    An object aberration, whose map is not computed for this, is taken to be weak.
+    """
+    room, kept, grid, what = _demand(volume, microscope, acquisition, fidelity, 0)
+    room.check_fits(kept, grid, what)
+
+
 def allot(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int = 0
 ) -> Batches:
     """The batches in which `image` stays within its budget and within the free memory.
 
-    levels: number of levels of an object aberration; 0 if it isn't known yet.
+    levels: number of levels of an object aberration.
     Raises ShortOfMemoryError if even single sources, whose steps are computed again, need more memory than is free.
     """
-    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
-    slices, images = grid.shape[0], len(acquisition.prisms) * len(acquisition.focus)
-    room = _room_for(volume, microscope, acquisition, fidelity, levels)
-    of_source = slices + images + levels if room.gradient else 1
-    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if room.gradient else 1)
-    shape = "×".join(map(str, volume.grid.shape))
-    what = (
-        f"{len(acquisition.prisms)} prism settings × {len(acquisition.focus)} focus planes of {shape} voxels by "
-        f'"{fidelity.propagation}"'
-    )
-    return room.allot(room.sources * of_source + of_map, grid, fidelity.memory, what)
+    room, kept, grid, what = _demand(volume, microscope, acquisition, fidelity, levels)
+    return room.allot(kept, grid, fidelity.memory, what)
 
 
 def allot_fields(passage: FieldPassage) -> Batches:
@@ -121,23 +121,30 @@ class _Room:
         batches = self._fitted(self._budget(memory, None))
         return Foreseen(self._peak(batches), self._least, batches.sources, batches.slabs)
 
+    def check_fits(self, kept: int, grid: Grid, what: str) -> None:
+        """Raise ShortOfMemoryError where the scene needs more memory than is free; see `allot`."""
+        free = free_bytes(self.device)
+        if free is None or AMPLE * kept * math.prod(grid.shape[1:]) <= free:
+            return
+        if self._peak(Batches(self.sources)) > free:
+            check_room(self._least, free, what)
+
     def allot(self, kept: int, grid: Grid, memory: int, what: str) -> Batches:
-        """The batches that fit into a budget and what is free. Raises ShortOfMemoryError where none do.
+        """The batches that fit into a budget and into what is free. Raises ShortOfMemoryError where none do.
 
         kept: at most, in AMPLE bytes for each pixel of the grid. what: the scene, for the message.
         """
-        free = free_bytes(self.device)
-        budget = self._budget(memory, free)
+        budget = self._budget(memory, free_bytes(self.device))
         if AMPLE * kept * math.prod(grid.shape[1:]) <= budget:
             return Batches(self.sources)
-        if free is not None and self._peak(Batches(self.sources)) > free:
-            check_room(self._least, free, what)
+        self.check_fits(kept, grid, what)
         return self._fitted(budget)
 
     def _budget(self, memory: int, free: int | None) -> int:
         """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""
         budget = memory if free is None else max(1, min(memory, free))
-        return min(budget, CACHED) if self.device.type == "cpu" and not self.gradient else budget
+        cached = self.device.type == "cpu" and not self.gradient and self.sources > 1
+        return min(budget, CACHED) if cached else budget
 
     def _fitted(self, budget: int) -> Batches:
         return fitted(self._peak, self.sources, budget, gradient=self.gradient, small_batches=self.small_batches)
@@ -154,6 +161,20 @@ class _Room:
                 _measured.popitem(last=False)
         _measured.move_to_end(kind)
         return _measured[kind].peak(batches)
+
+
+def _demand(
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int
+) -> "tuple[_Room, int, Grid, str]":
+    """The room of a volume's scene, what it keeps at most (see `_Room.allot`), its padded grid, and its name."""
+    room = _room_for(volume, microscope, acquisition, fidelity, levels)
+    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
+    slices, prisms, planes = grid.shape[0], len(acquisition.prisms), len(acquisition.focus)
+    of_source = slices + prisms * planes + levels if room.gradient else 1
+    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if room.gradient else 1)
+    shape = "×".join(map(str, volume.grid.shape))
+    what = f'{prisms} prism settings × {planes} focus planes of {shape} voxels by "{fidelity.propagation}"'
+    return room, room.sources * of_source + of_map, grid, what
 
 
 def _room_for(

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
-from torchdic.forward.foresee import allot, allot_fields
+from torchdic.forward.foresee import allot, allot_fields, check_fits
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, check_sampling
@@ -29,11 +29,13 @@ def image(
     """
     check_apertures(microscope, number(volume.background), volume.delta.dtype)
     check_sampling(microscope, volume.grid)
-    batches = allot(volume, microscope, acquisition, fidelity)
-    passage = Passage.through(volume, microscope, acquisition, fidelity)
-    if passage.levels:  # their number is now known, and with it the memory that they need
-        batches = allot(volume, microscope, acquisition, fidelity, passage.most_levels)
-    return passage.images(batches)
+    scene = volume, microscope, acquisition, fidelity
+    if fidelity.object_aberration is None:
+        batches = allot(*scene)
+        return Passage.through(*scene).images(batches)
+    check_fits(*scene)
+    passage = Passage.through(*scene)
+    return passage.images(allot(*scene, passage.most_levels))
 
 
 def image_field(
