@@ -227,7 +227,7 @@ def free(monkeypatch):
     return lambda number: monkeypatch.setattr(foresee, "free_bytes", lambda _device: number)
 
 
-@pytest.mark.parametrize("propagation", ["projection", "rays", "wave"])
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_what_the_least_batch_wants_is_refused_with_the_numbers(specimen, free, propagation):
     volume, fidelity = specimen(learned=True), Fidelity(propagation)
     least = foreseen(volume, SCOPE, ACQUISITION, fidelity).least

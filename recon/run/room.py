@@ -13,12 +13,15 @@ from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.unknowns import Setup, empty_medium
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
+from torchdic.forward.foresee import AMPLE
 from torchdic.memory.free import check_room, check_volume, free_bytes
 from torchdic.memory.held import course_of, most
 from torchdic.memory.signature import stand_in
 
 # Pixels along a side of the sample that is measured, and steps of its descent: the last of them hold what all hold.
 SIDE, STEPS = 40, 3
+# More bytes than the linear start holds for each pixel, slice, and image or slice.
+LINEAR = 64
 # Arrays of the volume's size that any descent holds: Δn, its gradient and Adam's two moments.
 ARRAYS = 4
 
@@ -37,10 +40,21 @@ def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit])
     if not isinstance(problem.fidelity, GivenFidelity):
         return
     fidelity, data = problem.fidelity.fidelity, problem.misfit.data
+    free = free_bytes(data.device)
+    if free is None or _ample(problem) <= free:
+        return
     images = foreseen(*problem.setup, fidelity, gradient=True).least
     wanted = images + held_beside_images(problem, misfit, fidelity)
     shape = "×".join(map(str, problem.setup.volume.grid.shape))
-    check_room(wanted, free_bytes(data.device), f"Steps of a reconstruction of {shape} voxels")
+    check_room(wanted, free, f"Steps of a reconstruction of {shape} voxels")
+
+
+def _ample(problem: Problem) -> int:
+    """More bytes than any descent by single sources needs: what fits even so need not be measured."""
+    volume, _, acquisition = problem.setup
+    slices, *sides = volume.grid.shape
+    images = len(acquisition.prisms) * len(acquisition.focus)
+    return math.prod(sides) * (slices + images) * (AMPLE + LINEAR * slices)
 
 
 def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fidelity: Fidelity) -> int:

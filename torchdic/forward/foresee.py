@@ -151,7 +151,8 @@ class _Room:
 
     @property
     def _least(self) -> int:
-        return least_of(self._peak, self.sources, gradient=self.gradient, small_batches=self.small_batches)
+        way = least_of(self._peak, self.sources, gradient=self.gradient, small_batches=self.small_batches)
+        return self._peak(way)
 
     def _peak(self, batches: Batches) -> int:
         kind = self.kind, self.gradient, torch.is_grad_enabled(), self.device.type

@@ -100,14 +100,15 @@ class VolumeSample:
         ]
 
     def run(self, sources: int, batches: Batches) -> None:
-        """Compute the sample. Where its content does not let light through, it is computed without any."""
+        """Compute the sample, without its content if that does not let light through."""
         try:
-            self._compute(sources, batches, self._delta)
+            self._compute(sources, batches)
         except ValueError:
-            self._compute(sources, batches, torch.zeros_like(self._delta))
+            self._delta = torch.zeros_like(self._delta)
+            self._compute(sources, batches)
 
-    def _compute(self, sources: int, batches: Batches, delta: Tensor) -> None:
-        delta = delta.detach().requires_grad_(self._learned[0])
+    def _compute(self, sources: int, batches: Batches) -> None:
+        delta = self._delta.detach().requires_grad_(self._learned[0])
         absorption = self._absorption
         if absorption is not None:
             absorption = absorption.detach().requires_grad_(self._learned[1])
@@ -184,4 +185,4 @@ def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float
 
 def _pooled(field: Tensor, sides: tuple[int, int]) -> Tensor:
     """A field's means over blocks of pixels, on the CPU; the field itself where it has no more pixels."""
-    return F.adaptive_avg_pool2d(field.detach().cpu()[None], sides)[0]
+    return F.adaptive_avg_pool2d(field.detach()[None], sides)[0].cpu()

@@ -54,10 +54,10 @@ def ways(sources: int, *, gradient: bool, small_batches: bool) -> Iterator[Batch
         yield Batches(1, slabs=True)
 
 
-def least_of(peak: Peak, sources: int, *, gradient: bool, small_batches: bool) -> int:
-    """The smallest number of bytes that can be held at once, with all sources at once or with single ones."""
+def least_of(peak: Peak, sources: int, *, gradient: bool, small_batches: bool) -> Batches:
+    """The way that holds least: all sources at once or single ones, with slabs or without."""
     tried = ways(sources, gradient=gradient, small_batches=small_batches)
-    return min(peak(way) for way in tried if way.sources in (1, sources))
+    return min((way for way in tried if way.sources in (1, sources)), key=peak)
 
 
 def fitted(peak: Peak, sources: int, budget: int, *, gradient: bool, small_batches: bool) -> Batches:
@@ -66,5 +66,7 @@ def fitted(peak: Peak, sources: int, budget: int, *, gradient: bool, small_batch
     first = next(tried)
     if peak(first) <= budget:
         return first
-    budget = max(budget, least_of(peak, sources, gradient=gradient, small_batches=small_batches))
-    return next(way for way in (first, *tried) if peak(way) <= budget)
+    least = least_of(peak, sources, gradient=gradient, small_batches=small_batches)
+    if peak(least) >= budget:
+        return least
+    return next(way for way in tried if peak(way) <= budget)
