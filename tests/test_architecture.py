@@ -65,7 +65,6 @@ LARGER = {
     "descend": "a public function since 0.1: what the data were recorded with, and how to descend",
     "sphere_field": "a public function since 0.1: the sphere, the light and the array",
     "radial_field": "as sphere_field, and the profile of the index",
-    "RayEquation.pull_back": "the derivative of one equation, in the order of its terms",
 }
 # Where a propagation's name may stand: its own room, the fidelity that names it, and the planner's comparisons.
 NAMED_IN = ("torchdic/propagation/", "torchdic/fidelity.py", "torchdic/planning/comparisons.py")

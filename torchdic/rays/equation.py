@@ -114,12 +114,32 @@ class RayEquation:
         sums_bar: of the sums, to which the slopes contribute h times.
         sampled_bar: of what was sampled, where the loss depends on it in other ways too.
         """
+        bars = self._pull_back_slopes(met, moves_bar, sums_bar, h)
+        y, x = self._positions(z, met.moving)
+        index_bar = bars.sampled if sampled_bar is None else bars.sampled + sampled_bar
+        place_bar, index_plane_bar = self.index.pull_back(z, y, x, index_bar)
+        planes_bar = [index_plane_bar]
+        if self.absorption is not None and bars.kappa is not None:
+            further, kappa_plane_bar = self.absorption.pull_back_value(z, y, x, bars.kappa)
+            place_bar.add_(further)
+            planes_bar.append(kappa_plane_bar)
+        moving_bar = torch.empty_like(met.moving)
+        of_place, of_momentum = moving_bar.split(2)
+        of_place.copy_(place_bar)
+        torch.addcmul(bars.p, met.dp, bars.path, out=of_momentum).add_(bars.drift)
+        straight_bar = background_bar = None
+        if self.straight.requires_grad:
+            v_bar = torch.mul(place_bar, z - self.face).addcmul_(bars.drift, met.q, value=-1)
+            straight_bar = torch.cat((place_bar, v_bar, bars.p, bars.less_q[None]))
+        if self.background.requires_grad:
+            background_bar = bars.sampled[0].sum() - self.background * bars.path.sum()
+        return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
+
+    def _pull_back_slopes(self, met: "Met", moves_bar: Tensor, sums_bar: Tensor, h: float) -> "_SlopesPulled":
+        """The loss's derivatives with respect to what the slopes are made of; see `pull_back`."""
         _, gy, gx = met.sampled.unbind()
         n, pz, r, q, dp, (_, v, p0, _) = met.n, met.pz, met.r, met.q, met.dp, self._unperturbed
-        learned = self.straight.requires_grad
-
-        out = moves_bar.mul_(r)
-        place_out, momentum_out = out.split(2)
+        place_out, momentum_out = moves_bar.mul_(r).split(2)
         path_bar = torch.mul(sums_bar[0], r).mul_(h)
         index_bar = torch.empty_like(met.sampled)
         n_bar = torch.mul(gy, momentum_out[0], out=index_bar[0]).addcmul_(gx, momentum_out[1])
@@ -137,7 +157,7 @@ class RayEquation:
             kappa_bar = n * kappa_out
             n_bar.addcmul_(met.kappa, kappa_out)
             r_bar.addcmul_(met.kappa, kappa_bar)
-        less_pz_bar = less_q_bar.clone() if learned else less_q_bar
+        less_pz_bar = less_q_bar.clone() if self.straight.requires_grad else less_q_bar
         p, turned_bar = dp + p0, None
         if self.turn:
             turn_bar = torch.mul(sums_bar[-1], r).mul_(h).div_(n + pz)
@@ -153,26 +173,7 @@ class RayEquation:
         p_bar = p.mul_(less_pz_bar)
         if turned_bar is not None:
             p_bar.add_(turned_bar)
-
-        y, x = self._positions(z, met.moving)
-        all_bar = index_bar if sampled_bar is None else index_bar + sampled_bar
-        place_bar, index_plane_bar = self.index.pull_back(z, y, x, all_bar)
-        planes_bar = [index_plane_bar]
-        if self.absorption is not None and kappa_bar is not None:
-            further, kappa_plane_bar = self.absorption.pull_back_value(z, y, x, kappa_bar)
-            place_bar.add_(further)
-            planes_bar.append(kappa_plane_bar)
-        moving_bar = torch.empty_like(met.moving)
-        of_place, of_momentum = moving_bar.split(2)
-        of_place.copy_(place_bar)
-        torch.addcmul(p_bar, dp, path_bar, out=of_momentum).add_(place_out)
-        straight_bar = background_bar = None
-        if learned:
-            v_bar = torch.mul(place_bar, z - self.face).addcmul_(place_out, q, value=-1)
-            straight_bar = torch.cat((place_bar, v_bar, p_bar, less_q_bar[None]))
-        if self.background.requires_grad:
-            background_bar = n_bar.sum() - self.background * path_bar.sum()
-        return Pulled(moving_bar, straight_bar, background_bar, planes_bar)
+        return _SlopesPulled(index_bar, kappa_bar, p_bar, less_q_bar, path_bar, place_out)
 
     def _positions(self, z: float, moving: Tensor) -> tuple[Tensor, Tensor]:
         place, v, _, _ = self._unperturbed
@@ -210,6 +211,21 @@ class Met(NamedTuple):
     q: Tensor
     # B + |δp|² + q²
     path: Tensor
+
+
+class _SlopesPulled(NamedTuple):
+    """The loss's derivatives with respect to what the slopes are made of.
+
+    sampled: Δn (so also n) and its slopes. kappa: κ, if light is absorbed. p: the momentum. less_q: −q. path:
+    B + |δp|² + q². drift: δy' and δx', each times r.
+    """
+
+    sampled: Tensor
+    kappa: Tensor | None
+    p: Tensor
+    less_q: Tensor
+    path: Tensor
+    drift: Tensor
 
 
 class Pulled(NamedTuple):
