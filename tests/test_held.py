@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchdic.memory.held import Allocation, Held, aligned, course_of, crowded, extrapolated, most
+from torchdic.memory.held import Allocation, Growth, Held, aligned, course_of, crowded, most
 from torchdic.memory.signature import is_learned, signature, stand_in
 from torchdic.planning.work_precision import peak_bytes
 
@@ -59,7 +59,7 @@ def test_two_and_three_parts_tell_what_many_hold(parts):
     """Whichever stage holds most, and though there is a stage for each part in turn."""
     two, three = (course_of(lambda n=n: chain(n)) for n in (2, 3))
     assert len(three) > len(two)
-    found, expected = extrapolated(two, three, parts), most(course_of(lambda: chain(parts)))
+    found, expected = Growth.of(two, three).at(parts), most(course_of(lambda: chain(parts)))
     assert found == pytest.approx(expected, rel=0.05)
 
 
@@ -67,7 +67,7 @@ def test_two_and_three_parts_tell_what_many_hold(parts):
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)), min_size=1, max_size=20), st.integers(2, 50))
 def test_stages_are_lines_and_the_largest_counts(stages, count):
     runs = [[Allocation(f"{i}", a + b * n) for i, (a, b) in enumerate(stages)] for n in (2, 3)]
-    assert extrapolated(*runs, count) == max(a + b * count for a, b in stages)
+    assert Growth.of(*runs).at(count) == max(a + b * count for a, b in stages)
 
 
 def test_runs_are_compared_where_they_do_the_same():

@@ -20,7 +20,7 @@ from torchdic.grid import Grid
 from torchdic.imaging import passband
 from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.memory.budget import Batches
-from torchdic.memory.held import Course, course_of, extrapolated, most
+from torchdic.memory.held import Course, Growth, course_of, most
 from torchdic.memory.signature import stand_in
 from torchdic.specimen.volume import Volume
 
@@ -40,32 +40,35 @@ class Sample:
     def __init__(self, run: Run, sources: int, scale: float, *, apart: bool = False) -> None:
         self._run, self._sources, self._scale, self._apart = run, sources, scale, apart
         self._graph = torch.is_grad_enabled()
-        self._courses: dict[tuple[int, Batches], Course] = {}
+        self._most: dict[tuple[int, Batches], int] = {}
+        self._growth: dict[tuple[bool, bool], Growth] = {}
 
     def peak(self, batches: Batches) -> int:
         """The most bytes that the scene holds at once."""
-        count, several = batches.sources, batches.sources < self._sources
-        held = most(self._course(min(count, 2), batches.slabs, several=several))
-        if count > 2:
-            two, three = (self._course(parts, batches.slabs, several=several) for parts in (2, 3))
-            held = extrapolated(two, three, count)
+        count, slabs, several = batches.sources, batches.slabs, batches.sources < self._sources
+        if count == 1:
+            held = self._most_of(1 + several, batches)
+        else:
+            if (slabs, several) not in self._growth:
+                two, three = (self._course(n * (1 + several), Batches(n, slabs)) for n in (2, 3))
+                self._growth[slabs, several] = Growth.of(two, three)
+            held = self._growth[slabs, several].at(count)
         if self._apart and several:
             # two single sources, and three: the third one's field is held beside them
-            pair, three = (most(self._run_of(sources, Batches(1))) for sources in (2, 3))
+            pair, three = (self._most_of(sources, Batches(1)) for sources in (2, 3))
             held += (three - pair) * (self._sources - 2 * count)
         return math.ceil(self._scale * held)
 
-    def _course(self, count: int, slabs: bool, *, several: bool) -> Course:
-        """The course of a batch of so many sources, the only one or one of two."""
-        return self._run_of(count * (1 + several), Batches(count, slabs))
+    def _most_of(self, sources: int, batches: Batches) -> int:
+        """The most bytes that a sample of so many sources holds."""
+        if (sources, batches) not in self._most:
+            self._most[sources, batches] = most(self._course(sources, batches))
+        return self._most[sources, batches]
 
-    def _run_of(self, sources: int, batches: Batches) -> Course:
-        if (sources, batches) not in self._courses:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the scene itself will warn
-                with torch.set_grad_enabled(self._graph):
-                    self._courses[sources, batches] = course_of(lambda: self._run(sources, batches))
-        return self._courses[sources, batches]
+    def _course(self, sources: int, batches: Batches) -> Course:
+        with warnings.catch_warnings(), torch.set_grad_enabled(self._graph):
+            warnings.simplefilter("ignore")  # the scene itself will warn
+            return course_of(lambda: self._run(sources, batches))
 
 
 class VolumeSample:
@@ -127,14 +130,14 @@ def field_sample(passage: FieldPassage) -> tuple[Run, float]:
     whole = passage.grid.widened(pad, pad)
     grid = Grid((1, ny, nx), passage.grid.spacing)
     scale = math.prod(whole.shape[1:]) / math.prod(grid.widened(padding, padding).shape[1:])
-    own = passage.transmission
-    few = own.detach()[..., :ny, :nx].cpu()
+    learned = passage.transmission.requires_grad
+    few = passage.transmission.detach()[..., :ny, :nx].cpu().clone()  # of its own: the whole field is not kept
     background = stand_in(passage.background)
     microscope, acquisition = stand_in(replace(passage.microscope, camera=None)), stand_in(passage.acquisition)
 
     def run(sources: int, batches: Batches) -> None:
         field = few if few.ndim == 2 else few[torch.arange(sources) % len(few)]
-        field = field.clone().requires_grad_(own.requires_grad)
+        field = field.clone().requires_grad_(learned)
         lit = _lit_by(microscope, sources, fidelity)
         sample = FieldPassage(field, grid, background, lit, acquisition, replace(fidelity, padding=padding))
         images = sample.images(batches)

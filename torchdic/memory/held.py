@@ -2,6 +2,7 @@
 
 import weakref
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -89,16 +90,34 @@ def most(course: Course) -> int:
     return max((allocation.held for allocation in course), default=0)
 
 
-def extrapolated(two: Course, three: Course, count: int) -> int:
-    """The most bytes that `count` equal parts hold at once, from the courses of two parts and of three parts.
+@dataclass(frozen=True)
+class Growth:
+    """How the most bytes in use at once grow with the number of equal parts that are computed together.
 
-    After each allocation that both runs make, the bytes in use are linear in the number of parts. Each of these lines
-    is extended to `count` parts, and the largest result counts: one stage may hold the most in a small run, another
-    stage in a large run. Where a run makes allocations for each of its parts in turn, the first parts of both runs are
-    compared, and the last ones. (A single part would not do: its arrays of length 1 are treated in other ways.)
+    After each allocation that two parts and three parts both make, the bytes in use are linear in the number of parts.
+    One stage may hold the most in a small run, another stage in a large run: the largest of these lines counts.
+    lines: bytes of two parts, and of each further part; only those that are the largest for some number of parts.
     """
-    forward, backward = aligned(two, three), aligned(two[::-1], three[::-1])
-    return max((a + (b - a) * (count - 2) for a, b in (*forward, *backward)), default=0)
+
+    lines: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, two: Course, three: Course) -> "Growth":
+        """The growth that the courses of two parts and of three parts show.
+
+        Where a run makes allocations for each of its parts in turn, the first parts of both runs are compared, and the
+        last ones. (A single part would not do: its arrays of length 1 are treated in other ways.)
+        """
+        pairs = {(a, b - a) for run in (1, -1) for a, b in aligned(two[::run], three[::run])}
+        lines: list[tuple[int, int]] = []
+        for held, further in sorted(pairs, key=lambda line: (-line[1], -line[0])):  # the steepest one first
+            if not lines or held > lines[-1][0]:
+                lines.append((held, further))
+        return cls(tuple(lines))
+
+    def at(self, parts: int) -> int:
+        """The most bytes that so many parts hold, two or more."""
+        return max((held + further * (parts - 2) for held, further in self.lines), default=0)
 
 
 def aligned(one: Course, other: Course) -> Iterator[tuple[int, int]]:
