@@ -6,6 +6,7 @@ depends on how much of the array is empty, so that this is part of the kind.
 """
 
 import math
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
@@ -35,6 +36,8 @@ MAP = 40
 # Number of kinds of scenes whose measurements are kept.
 KEPT = 32
 _measured: "OrderedDict[Hashable, Sample]" = OrderedDict()
+# A second thread waits for what the first one measures.
+_measuring = threading.RLock()
 
 
 def foreseen(
@@ -156,12 +159,13 @@ class _Room:
 
     def _peak(self, batches: Batches) -> int:
         kind = self.kind, self.gradient, torch.is_grad_enabled(), self.device.type
-        if kind not in _measured:
-            _measured[kind] = self.make()
-            if len(_measured) > KEPT:
-                _measured.popitem(last=False)
-        _measured.move_to_end(kind)
-        return _measured[kind].peak(batches)
+        with _measuring:
+            if kind not in _measured:
+                _measured[kind] = self.make()
+                if len(_measured) > KEPT:
+                    _measured.popitem(last=False)
+            _measured.move_to_end(kind)
+            return _measured[kind].peak(batches)
 
 
 def _demand(

@@ -62,11 +62,13 @@ def least_of(peak: Peak, sources: int, *, gradient: bool, small_batches: bool) -
 
 def fitted(peak: Peak, sources: int, budget: int, *, gradient: bool, small_batches: bool) -> Batches:
     """The first of the `ways` that stays within a budget in bytes. If none does, the one that holds least."""
-    tried = ways(sources, gradient=gradient, small_batches=small_batches)
-    first = next(tried)
-    if peak(first) <= budget:
-        return first
-    least = least_of(peak, sources, gradient=gradient, small_batches=small_batches)
+    kind = {"gradient": gradient, "small_batches": small_batches}
+    together = [way for way in ways(sources, **kind) if way.sources == sources]
+    for way in together:
+        if peak(way) <= budget:
+            return way
+    # the least is found before batches are, because a small budget makes them needless
+    least = least_of(peak, sources, **kind)
     if peak(least) >= budget:
         return least
-    return next(way for way in tried if peak(way) <= budget)
+    return next(way for way in ways(sources, **kind) if way not in together and peak(way) <= budget)
