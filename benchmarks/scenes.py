@@ -261,7 +261,11 @@ def yeast(centre: tuple[float, float, float], radius: float) -> CellPhantom:
 
 
 def yeast_setup() -> Setup:
-    """One prism, many planes, a wide aperture; a neighbour is cut by the field's edge."""
+    """One prism, many planes, a wide aperture; a neighbour is cut by the field's edge.
+
+    Without noise the true volume leaves a misfit of 0.003 with 112 directions, if 24 voxels of truth are added on each
+    side, and 0.055 with 40. Without those voxels it leaves 0.24 and 0.30, most of it beside the neighbour.
+    """
     return Setup(
         "strong",
         Together((yeast((0.0, 0.6, -1.2), 2.7), yeast((0.3, -2.4, 7.4), 2.4))),
