@@ -6,9 +6,10 @@ import torch
 from absolute import Absolute
 
 from recon.fit.bounds import SHARPNESS, Bounds
-from recon.fit.misfit import GaussianMisfit, spatial_variance
 from recon.fit.prior import SMOOTHING, Magnitude, TotalVariation, magnitude, total_variation
 from recon.fit.schedule import cosine, held_then_annealed
+from recon.misfit.base import spatial_variance
+from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Grid, Volume
 
 BOUNDS = {

@@ -23,7 +23,7 @@ from matplotlib import image as pictures
 from data_synthetic import GaussianBall
 from recon.cli import main
 from recon.config.reading import load
-from recon.fit.misfit import GaussianMisfit
+from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
 from recon.report.metrics import volume_error
 from recon.run import reconstruct, recorded, results

@@ -7,9 +7,9 @@ import torch
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
-from recon.fit.misfit import GaussianMisfit
 from recon.fit.problem import Problem, Recipe
 from recon.fit.unknowns import IndexDifference, Setup, Unknown, Unknowns, empty_medium
+from recon.misfit.gaussian import GaussianMisfit
 from recon.report.metrics import volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint

@@ -8,10 +8,11 @@ from typing import Literal
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
-from recon.fit.misfit import GaussianMisfit, Misfit
 from recon.fit.planned import GivenFidelity, PlannedFidelity
 from recon.fit.prior import Magnitude, Prior, TotalVariation
 from recon.fit.unknowns import IndexDifference, Setup, Unknown
+from recon.misfit.base import Misfit
+from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Fidelity
 
 

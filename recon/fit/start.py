@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.fit.misfit import spatial_variance
+from recon.misfit.base import spatial_variance
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume
 from torchdic.linear import linear_image, transfer_functions
 

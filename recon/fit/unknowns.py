@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
-from recon.fit.misfit import Misfit
 from recon.fit.schedule import cosine
 from recon.fit.start import linear_start
+from recon.misfit.base import Misfit
 from torchdic import Acquisition, Grid, Microscope, Volume
 
 # Distance in Δn from its bounds that every voxel starts with.

@@ -9,7 +9,7 @@ _BLOCKS = 64  # the background is smooth, so it is fitted to block means, at mos
 
 _TUKEY = 4.685  # Tukey's biweight: 95 % efficient on Gaussian noise
 
-_NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
+NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
 
 
 def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[np.ndarray, "y x"]:
@@ -73,13 +73,14 @@ def _absolute(residual: np.ndarray) -> np.ndarray:
 
 def _biweight(residual: np.ndarray) -> np.ndarray:
     """Tukey's biweights. residual: relative to the median residual."""
-    return np.clip(1 - (residual * (_NORMAL_MAD / _TUKEY)) ** 2, 0, None) ** 2
+    return np.clip(1 - (residual * (NORMAL_MAD / _TUKEY)) ** 2, 0, None) ** 2
 
 
 def noise_level(images: Real[np.ndarray, "*planes y x"]) -> float | None:
     """The standard deviation of the noise in images; None for images of less than 3 × 3 pixels.
 
-    images: (..., y, x), in any unit, which is the result's unit too.
+    images: (..., y, x), in any unit, which is the result's unit too. Pixels that are NaN are left out; where they leave
+    no 3 × 3 pixels the result is None.
 
     The images are filtered with a mask that gives 0 for anything smooth, and the noise follows from the median
     magnitude of the result (Immerkær, Computer Vision and Image Understanding 64, 300, 1996, who takes the mean;
@@ -89,7 +90,8 @@ def noise_level(images: Real[np.ndarray, "*planes y x"]) -> float | None:
         return None
     along_x = np.diff(images.astype(np.float64), n=2, axis=-1)
     masked = np.diff(along_x, n=2, axis=-2)  # [1 −2 1]ᵀ[1 −2 1], whose squares sum to 36
-    return float(np.median(np.abs(masked))) / (6 * _NORMAL_MAD)
+    known = masked[np.isfinite(masked)]
+    return float(np.median(np.abs(known))) / (6 * NORMAL_MAD) if known.size else None
 
 
 def _polynomials(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], order: int) -> np.ndarray:

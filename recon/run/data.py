@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 
 from recon.config.schema import Config, ConfigError
-from recon.fit.misfit import spatial_variance
+from recon.misfit.base import spatial_variance
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError

@@ -55,7 +55,7 @@ def metrics(
     found: dict[str, Any] = {
         "propagation": problem.fidelity.last(last.plans).propagation,
         "misfit": float(problem.misfit(images)),
-        "noise_misfit": problem.misfit.of_noise(noise) if len(noise) == len(reports) else None,
+        "noise_misfit": problem.misfit.of_noise(noise if len(noise) == len(reports) else None),
         "residual_rms": residual_rms(images, problem.misfit.data),
         "steps": last.number,
         "seconds": round(last.seconds, 3),

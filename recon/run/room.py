@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from recon.fit.descent import minimise
-from recon.fit.misfit import Misfit
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.unknowns import Setup, empty_medium
+from recon.misfit.base import Misfit
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
 from torchdic.forward.foresee import AMPLE
 from torchdic.memory.free import check_room, check_volume, free_bytes
