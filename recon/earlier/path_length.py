@@ -28,8 +28,9 @@ from recon.fit.unknowns import Setup
 from torchdic import Grid
 from torchdic.scalar import number
 
-# Standard deviation σ in rad of the phase at the border of the field, where the medium alone is expected.
-_BORDER_PHASE = 0.1
+# Standard deviations σ in rad of the phase at the border of the field, where the medium alone is expected. The problem
+# is solved with one after the other, so that a border on which the specimen lies shows before it is held to 0.
+_BORDER_PHASES = (1.0, 0.3, 0.1, 0.03)
 
 # Part of a side that counts as border, on each side.
 _BORDER = 1 / 32
@@ -37,9 +38,8 @@ _BORDER = 1 / 32
 # The border's least weight relative to the mean weight of the differences: it fixes what they don't measure.
 _LEAST_BORDER = 1e-4
 
-# Solutions, each with the border's weight where the last one's phase stood out of it; steps of conjugate gradients of
-# each, and the residual, relative to the right-hand side, at which they end.
-_ROUNDS, _STEPS, _SOLVED = 4, 200, 1e-6
+# Steps of conjugate gradients, and the residual relative to the right-hand side at which they end.
+_STEPS, _SOLVED = 200, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,8 @@ def path_length(
     data: (prism, focus, y, x), relative to the empty bright field, on the volume's pixels.
     setup: the volume gives the grid alone.
     noise: standard deviation of the noise in the unit of the data, one for all prisms or one for each; None where it
-    is unknown. Its mean square sets the weight, see `recon.earlier.weight`; one weight serves all sections.
+    is unknown. Its mean square sets the weight, by the counted discrepancy of `recon.earlier.weight`; one
+    weight serves all sections.
 
     The model knows of the microscope the wavelength and the prisms alone: neither the light of other sections, nor the
     pupil, the condenser and the polarisers. The arrays are periodic.
@@ -80,11 +81,12 @@ def path_length(
     variance = None if levels is None else sum(n**2 for n in levels) / len(levels)
     problem = Integration(volume.grid, phase_differences(data, acquisition.prisms))
     components = problem.components()
-    weight, rule = choose_weight(components, None if variance is None else variance * components.freedom)
+    weight, rule = choose_weight(components, variance, counted=True)
     if math.isinf(weight):
         phase = torch.zeros_like(problem.differences[0].phase)
     else:
-        phase = problem.solved(weight, components.noise(weight) if variance is None else variance)
+        # the same as the given variance, where the weight is the counted discrepancy's
+        phase = problem.solved(weight, components.noise(weight))
     opl = phase * microscope.wavelength / (2 * math.pi)
     delta = spread(opl, [number(focus) for focus in acquisition.focus], volume.grid)
     return PathLength(opl.to(data.dtype), delta.to(data.dtype), weight, rule)
@@ -94,6 +96,7 @@ class Integration:
     """The least-squares problem of the phase behind phase differences, for all sections at once.
 
     grid: its number of slices plays no part. differences: at least one.
+    Raises ValueError where no frequency of the grid has a difference.
     """
 
     def __init__(self, grid: Grid, differences: Sequence[PhaseDifference]) -> None:
@@ -106,6 +109,12 @@ class Integration:
         self.transfers = [_difference(frequencies, d.shear) for d in differences]
         squares = [t.abs().square() / d.variance for t, d in zip(self.transfers, differences, strict=True)]
         self.seen = torch.stack(squares).sum(0)
+        if float(self.seen.max()) <= torch.finfo(torch.float64).eps:
+            shears = ", ".join(f"({y:g}, {x:g})" for y, x in (d.shear for d in differences))
+            ny, nx = grid.shape[1:]
+            raise ValueError(
+                f"shear {shears} µm shows no phase in a field of {ny} × {nx} pixels: all are alike along it"
+            )
         self.curvature = (2 * math.pi) ** 4 * frequencies.square().sum(0).square()
 
     def components(self) -> Components:
@@ -140,12 +149,12 @@ class Integration:
         plain = self.seen + weight * self.curvature
         right = torch.fft.ifft2(self.right()).real
         border = _border(right)
-        pull = max(noise / _BORDER_PHASE**2, _LEAST_BORDER * float(self.seen.mean()))
         phase, share = torch.zeros_like(right), border.to(right).expand_as(right)
-        for _ in range(_ROUNDS):
+        for sigma in _BORDER_PHASES:
+            pull = max(noise / sigma**2, _LEAST_BORDER * float(self.seen.mean()))
             phase = _conjugate_gradients(plain, pull * share, right, phase)
-            phase = phase - phase[:, border].median(-1).values[:, None, None]
-            share = border / (1 + (phase / _BORDER_PHASE).square())
+            phase = phase - phase[:, border].quantile(0.5, -1)[:, None, None]
+            share = border / (1 + (phase / sigma).square())
         return phase
 
 
@@ -206,7 +215,7 @@ def spread(opl: Float[Tensor, "focus y x"], depths: Sequence[float], grid: Grid)
     sections and constant beyond them, over the depth of the volume. So ∫Δn dz is the mean path length of the sections.
 
     A section in focus shows the path through the whole specimen, and fine detail alone fades with the distance from it.
-    So the depth of field λn/NA², which is a tenth of a thick cell, would make Δn ten times too large.
+    So Δn over the depth of field λn/NA², a fraction of a cell's thickness, would be as many times too large.
     """
     order = sorted(range(len(depths)), key=depths.__getitem__)
     place = np.array([depths[i] for i in order])

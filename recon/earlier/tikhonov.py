@@ -29,6 +29,9 @@ from torchdic.scalar import number
 # Bytes that the blocks of some rows of frequencies may take at once.
 _MEMORY = 256 << 20
 
+# Of the cross-validation. A strong specimen with little noise needs it: there the plain one's Δn is without limit.
+_ROBUSTNESS = 0.3
+
 # Steps of the projected gradient, and the change relative to Δn below which it ends.
 _STEPS, _STILL = 300, 1e-4
 
@@ -110,7 +113,8 @@ def tikhonov(
     setup: the volume gives the grid and the medium; its Δn plays no part.
     noise: standard deviation of the noise in the unit of the data, one for all prisms or one for each; None where it
     is unknown. It sets the weight, see `recon.earlier.weight`.
-    bounds: of Δn. The weight is that of the free Δn, and the same sum is then lowered within the bounds.
+    bounds: of Δn. The weight is that of the free Δn, and the same sum is then lowered within the bounds, where
+    the misfit is higher.
     sources: condenser directions of the transfer function.
 
     The images see nothing of each slice's mean: it is 0 where there are no bounds. The transfer function is held
@@ -120,17 +124,17 @@ def tikhonov(
     linear response (a bias of 0), and as `torchdic.linear.transfer_functions` where none exists.
     """
     volume, microscope, acquisition = setup
-    misfit = GaussianMisfit(data)
     check_images(data, setup)
+    misfit = GaussianMisfit(data)
     levels = noise_of_prisms(noise, len(data))
     fidelity = Fidelity("wave", sources=sources)
     scale = misfit.variance.rsqrt()
     model = LinearModel(volume.grid, _weighted_transfer(setup, fidelity, scale))
     empty = linear_image(empty_medium(volume.grid, number(volume.background), data), microscope, acquisition, fidelity)
     d = (scale * (data - empty)).flatten(0, 1)
-    target = None if levels is None else misfit.of_noise(levels) * d.numel()
     components = _components(model, d)
-    weight, rule = choose_weight(components, target)
+    target = None if levels is None else misfit.of_noise(levels)
+    weight, rule = choose_weight(components, target, robustness=_ROBUSTNESS)
     delta = _solved(model, d, weight)
     if bounds != FREE:
         steepest = float(components.values.max())

@@ -5,12 +5,17 @@ eigenvalues s and energies e of the data along them. The prior lets the share s/
     residual(w) = outside + Σ e·(w/(s + w))²,    fitted(w) = Σ s/(s + w),
 where `outside` is the energy of the data that no x reaches, and `fitted` counts the numbers that the data determine.
 
-V. A. Morozov, Soviet Math. Dokl. 7, 414 (1966), for the discrepancy;
-G. H. Golub, M. Heath and G. Wahba, Technometrics 21, 215 (1979), for generalised cross-validation;
-M. A. Lukas, Inverse Problems 22, 1883 (2006), for its robust form.
+The discrepancy takes the weight whose residual is the noise's, variance·freedom. It smooths too much, since even the
+right x is fitted to some of the noise. Counted, the residual is variance·(freedom − fitted(w)) instead.
+
+V. A. Morozov, Soviet Math. Dokl. 7, 414 (1966), for the discrepancy; A. M. Thompson, J. C. Brown, J. W. Kay and D. M.
+Titterington, IEEE Trans. Pattern Anal. Mach. Intell. 13, 326 (1991), for the counted one; G. H. Golub, M. Heath and
+G. Wahba, Technometrics 21, 215 (1979), for generalised cross-validation; M. A. Lukas, Inverse Problems 22, 1883 (2006),
+for its robust form.
 """
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,10 +32,6 @@ _REACH = 1e-5
 
 # Eigenvalues below this part of the greatest are 0 but for rounding.
 _ROUNDING = 1e-13
-
-# Robustness of the cross-validation, between 0 and 1, where 1 is the plain one. Where the model and not the noise is
-# what errs, as with a strong specimen and little noise, the plain one's weight goes to 0 and its Δn to infinity.
-_ROBUSTNESS = 0.3
 
 # The part of cross-validation's weight below which a discrepancy's shows the model's error instead of the noise.
 _TRUSTED = 0.1
@@ -80,30 +81,39 @@ class Components:
         return self.residual(weight) / (self.freedom - self.fitted(weight))
 
 
-def choose_weight(components: Components, noise: float | None) -> tuple[float, Rule]:
+def choose_weight(
+    components: Components, variance: float | None, *, counted: bool = False, robustness: float = 1.0
+) -> tuple[float, Rule]:
     """The weight of a quadratic prior, and the rule by which it is chosen.
 
-    noise: energy Σ|d − A x|² that the noise leaves; None where it is unknown.
-    The discrepancy takes the weight whose residual is the noise's, and an infinite one where x = 0 leaves no more than
-    that. Where the noise is unknown, or reached by no weight that is at least a tenth of cross-validation's, the latter
-    is taken: there the model's errors and not the noise hold the residual up.
+    variance: of the noise in one real number of the data; None where it is unknown. counted: whether the discrepancy
+    counts the fitted numbers. robustness: of `cross_validated`.
+    The discrepancy's weight is infinite where x = 0 leaves no more than the noise. Where the noise is unknown, or
+    reached by no weight that is at least a tenth of cross-validation's, the latter is taken: there the model's errors
+    and not the noise hold the residual up.
     """
-    top = float(components.values.max()) / _REACH
-    if noise is not None and noise >= components.residual(top):
-        return math.inf, "discrepancy"
-    validated = cross_validated(components)
-    least = _TRUSTED * validated
-    if noise is None or components.residual(least) > noise:
+    validated = cross_validated(components, robustness)
+    if variance is None:
         return validated, "cross-validation"
-    bracket = (math.log(least), math.log(top))
-    found = root_scalar(lambda t: components.residual(math.exp(t)) / noise - 1, bracket=bracket, xtol=1e-6)
-    return math.exp(found.root), "discrepancy"
+
+    def excess(log_weight: float) -> float:
+        weight = math.exp(log_weight)
+        expected = components.freedom - (components.fitted(weight) if counted else 0)
+        return components.residual(weight) - variance * expected
+
+    least, top = math.log(_TRUSTED * validated), math.log(float(components.values.max()) / _REACH)
+    if excess(top) <= 0:
+        return math.inf, "discrepancy"
+    if excess(least) > 0:
+        return validated, "cross-validation"
+    return math.exp(root_scalar(excess, bracket=(least, top), xtol=1e-6).root), "discrepancy"
 
 
-def cross_validated(components: Components) -> float:
-    """The weight for which robust generalised cross-validation is least.
+def cross_validated(components: Components, robustness: float = 1.0) -> float:
+    """The weight for which generalised cross-validation is least.
 
-    It is residual/(freedom − fitted)²·(γ + (1 − γ)·Σ (s/(s + w))²/freedom).
+    It is residual/(freedom − fitted)²·(γ + (1 − γ)·Σ (s/(s + w))²/freedom), γ the robustness in (0, 1]. With 1 it is
+    the plain one, whose weight goes to 0 and x to infinity where the model errs much more than the noise.
     """
     greatest = math.log(float(components.values.max()))
     low, high = greatest + math.log(_REACH), greatest - math.log(_REACH)
@@ -113,8 +123,8 @@ def cross_validated(components: Components) -> float:
         passed = components.values / (components.values + weight)
         left = components.freedom - components.fitted(weight)
         unstable = float((components.counts * passed.square()).sum()) / components.freedom
-        residual = max(components.residual(weight), math.ulp(0.0))
-        return math.log(residual * (_ROBUSTNESS + (1 - _ROBUSTNESS) * unstable)) - 2 * math.log(left)
+        residual = max(components.residual(weight), sys.float_info.min / robustness)
+        return math.log(residual * (robustness + (1 - robustness) * unstable)) - 2 * math.log(left)
 
     steps = math.ceil((high - low) / math.log(10) * _PER_DECADE)
     ladder = [low + (high - low) * i / steps for i in range(steps + 1)]
