@@ -3,7 +3,7 @@
     python benchmarks/scenes.py [--out scenes] [--cache DIR] [--scenes NAME ...] [--drawn N]
 
 It draws each scene's sections and its images into a folder, and prints a table. "noise misfit" is the misfit that noise
-alone leaves (`recon.fit.misfit`).
+alone leaves (`recon.misfit`).
 
 Where a specimen's exact field is known, it makes the images. The others come from a finer model: voxels of a third of
 the depth and half of the width, 112 condenser directions on other rings than the 18, 24 or 40 of a reconstruction, and
@@ -29,7 +29,7 @@ from torch import Tensor
 
 from data_synthetic import Bead, CellPhantom, Ellipsoid, GaussianBall, Organelle, Specimen
 from recon.cli import demo
-from recon.fit.misfit import GaussianMisfit
+from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
 from recon.run.exact_images import ExactSpecimen, exact_images
 from specimens import Fibre, GradedEllipsoid, Together, any_specimen, solid, stronger
@@ -91,7 +91,9 @@ class Scene:
     @property
     def noise_misfit(self) -> float:
         """What noise alone leaves of the misfit."""
-        return GaussianMisfit(self.data).of_noise(self.noise)
+        alone = GaussianMisfit(self.data).of_noise(self.noise)
+        assert alone is not None
+        return alone
 
 
 def acquisition(shears: Sequence[tuple[float, float]], biases: Sequence[float], focus: Sequence[float]) -> Acquisition:
