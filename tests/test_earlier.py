@@ -13,7 +13,7 @@ from recon.earlier.phase_difference import phase_differences
 from recon.earlier.tikhonov import FREE, LinearModel, tikhonov
 from recon.earlier.weight import Components, choose_weight, cross_validated
 from recon.fit.bounds import Bounds
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.background import noise_level
 from recon.report.metrics import volume_error

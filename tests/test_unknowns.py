@@ -8,7 +8,8 @@ from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.problem import Problem, Recipe
-from recon.fit.unknowns import IndexDifference, Setup, Unknown, Unknowns, empty_medium
+from recon.fit.setup import Setup, empty_medium
+from recon.fit.unknowns import IndexDifference, Unknown, Unknowns
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report.metrics import volume_error
 from recon.run import checkpoint
@@ -36,7 +37,7 @@ class BiasOffset(Unknown):
 
     def put(self, value, setup):
         prisms = [replace(prism, bias=prism.bias + value) for prism in setup.acquisition.prisms]
-        return setup._replace(acquisition=Acquisition(prisms, setup.acquisition.focus))
+        return replace(setup, acquisition=Acquisition(prisms, setup.acquisition.focus))
 
 
 @pytest.fixture
@@ -128,7 +129,8 @@ def test_the_bias_alone_is_found_where_the_volume_is_known(data, truth):
 def test_values_are_put_where_they_belong_and_keep_their_graph(data):
     two = problem(data, DECLARED, BiasOffset(0.05))
     unknowns = Unknowns.at_start(two.unknowns, two.setup, two.misfit)
-    volume, microscope, acquisition = unknowns.into(two.setup)
+    put = unknowns.into(two.setup)
+    volume, microscope, acquisition = put.volume, put.microscope, put.acquisition
     assert volume.delta.requires_grad
     assert torch.equal(volume.delta.detach(), unknowns.values()["delta"])
     assert microscope is MICROSCOPE
