@@ -1,34 +1,35 @@
-"""The nuisances beside a given Δn: one Gauss–Newton step, whose Jacobian is made of few images.
-
-The nuisances' entries mostly act on a single image, or on the images of a single prism or plane. All such entries are
-moved at once; the difference of the images is then the Jacobian of each of them in its own images. Images of the same
-volume that differ by their prisms alone are formed together, so that light is propagated through the volume once.
+"""The nuisances beside a given Δn: a few Gauss–Newton steps with the images of few propagations.
 
 With the images I, the misfit's gradient g and curvature c by each pixel, and the Jacobian J, a step solves
     (Jᵀ c J + damping) step = −Jᵀ g
-(K. Levenberg, Quart. Appl. Math. 2, 164, 1944).
+(K. Levenberg, Quart. Appl. Math. 2, 164, 1944). The steps are taken on the images of `recon.fit.nuisances.nearby`, and
+the last of them is then judged by images that are formed anew.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from recon.fit.nuisances.base import Nuisance
+from recon.fit.nuisances.nearby import Nearby
 from recon.fit.setup import Setup
-from recon.fit.unknowns import with_values
 from recon.misfit.base import Misfit
 from torchdic import Fidelity
-from torchdic.scalar import number
 
-# A parameter's scale is this many of its steps. A nuisance moves by LONGEST scales at most.
-SCALE, LONGEST = 100.0, 3.0
+# A parameter's scale is this many of its steps. No entry moves by more than LONGEST scales at once.
+SCALE, LONGEST = 10.0, 1.5
 # Damping: a share of the Hessian's diagonal, and a curvature per scale² that holds what the images say nothing of.
 RELATIVE, ABSOLUTE = 1e-7, 1e-6
+# Steps on the nearby images, fewer once they are shorter than this many scales.
+STEPS, SHORT = 5, 1e-4
 # How often a step that raises the misfit is halved before it is given up.
 HALVINGS = 4
+# Differences of images of less than this many times their dtype's eps are those of rounding.
+ROUNDING = 8.0
+
+Parameters = dict[str, Tensor]
 
 
 @torch.no_grad()
@@ -38,40 +39,32 @@ def refined(
     setup: Setup,
     misfit: Misfit,
     fidelity: Fidelity,
-    images: Float[Tensor, "prism focus y x"] | None = None,
-) -> dict[str, Tensor]:
-    """The nuisances' parameters after one Gauss–Newton step, by name; as they were where no step lowers the misfit.
+    images: Float[Tensor, "prism focus row column"] | None = None,
+) -> Parameters:
+    """The nuisances' parameters with which the images of a given Δn are closer to the data, by name.
 
     unknowns: what is refined, in the order in which values are put into the setup. parameters: of each, by its name.
     setup: the current volume, and what is known; not yet the nuisances' values. misfit: holds the data.
     fidelity: of the images. images: `formed` of the setup with the current values, where the caller has them.
 
-    The misfit of the result is never above that of the given parameters. Nothing is propagated but for unknowns that
-    act on how images are formed: one propagation for those of the prisms, one for the focus, and one for each try.
+    The misfit of the result is never above that of the given parameters, which are returned where nothing lowers it.
+    Images are formed for unknowns alone that act on how they are formed: with one propagation for all those of the
+    prisms, one for the focus, and one for each try, which is one as a rule.
     """
+    before = {u.name: parameters[u.name].detach() for u in unknowns}
     if not unknowns:
-        return {}
-    now = {u.name: parameters[u.name].detach() for u in unknowns}
-    current = _placed(unknowns, now, setup)
-    sets = _moved_sets(unknowns, now, setup)
-    anew = [moved for moved, forms in sets if forms]
-    formed = _formed(([current] if images is None else []) + anew, fidelity)
-    if images is None:
-        images, *formed = formed
-    model, rest = current.recorded(images), iter(formed)
-    differences = [moved.recorded(next(rest) if forms else images) - model for moved, forms in sets]
-    step = _gauss_newton(unknowns, now, differences, misfit, model)
-
-    before = float(misfit(model))
-    optical = any(u.forms for u in unknowns)
-    for _ in range(HALVINGS + 1):
-        tried = {name: now[name] + step[name] for name in now}
-        placed = _placed(unknowns, tried, setup)
-        after = float(misfit(placed.recorded(placed.formed(fidelity) if optical else images)))
-        if after <= before:
-            return tried
-        step = {name: part / 2 for name, part in step.items()}
-    return now
+        return before
+    nearby = Nearby(unknowns, before, setup, fidelity, images)
+    found = before
+    for _ in range(STEPS):
+        step, length = _gauss_newton(nearby, found, misfit)
+        following = _lowered(nearby, found, step, misfit)
+        if following is None:
+            break
+        found = following
+        if length < SHORT:
+            break
+    return _judged(nearby, found, misfit, fidelity) if nearby.bends else found
 
 
 @torch.no_grad()
@@ -87,68 +80,61 @@ def best_brightness(images: Float[Tensor, "prism focus y x"], misfit: Misfit) ->
     return torch.where(norm > 0, found, 1).to(images)
 
 
-def _placed(unknowns: Sequence[Nuisance], parameters: Mapping[str, Tensor], setup: Setup) -> Setup:
-    return with_values(unknowns, {u.name: u.value(parameters[u.name]) for u in unknowns}, setup)
-
-
-def _moved_sets(
-    unknowns: Sequence[Nuisance], parameters: Mapping[str, Tensor], setup: Setup
-) -> list[tuple[Setup, bool]]:
-    """For each unknown and each of its directions the setup one step along it, and whether images are formed anew."""
-    values = {u.name: u.value(parameters[u.name]) for u in unknowns}
-    return [
-        (with_values(unknowns, values | {u.name: u.of_entries(u.told(p) + u.step * direction)}, setup), u.forms)
-        for u, p in ((u, parameters[u.name]) for u in unknowns)
-        for direction in u.directions(p)
-    ]
-
-
-def _formed(setups: Sequence[Setup], fidelity: Fidelity) -> list[Tensor]:
-    """Each setup's formed images; those of the same specimen, microscope and planes are formed together."""
-    together: dict[object, list[int]] = {}
-    for index, setup in enumerate(setups):
-        planes = tuple(number(focus) for focus in setup.acquisition.focus)
-        together.setdefault((id(setup.volume), id(setup.microscope), planes), []).append(index)
-    formed: dict[int, Tensor] = {}
-    for members in together.values():
-        first = setups[members[0]]
-        prisms = [prism for index in members for prism in setups[index].acquisition.prisms]
-        acquisition = replace(first.acquisition, prisms=prisms)
-        bare = Setup(first.volume, first.microscope, acquisition)
-        parts = bare.formed(fidelity).split(len(first.acquisition.prisms))
-        formed |= dict(zip(members, parts, strict=True))
-    return [formed[index] for index in range(len(setups))]
-
-
-def _gauss_newton(
-    unknowns: Sequence[Nuisance],
-    parameters: Mapping[str, Tensor],
-    differences: Sequence[Tensor],
-    misfit: Misfit,
-    model: Float[Tensor, "prism focus y x"],
-) -> dict[str, Tensor]:
-    """The damped Gauss–Newton step of each parameter. differences: of the images, one for each unknown's direction."""
+def _gauss_newton(nearby: Nearby, parameters: Parameters, misfit: Misfit) -> tuple[Parameters, float]:
+    """The damped Gauss–Newton step of each parameter, and its longest entry in scales."""
+    model = nearby.recorded(parameters)
+    columns = [_told_from_rounding(column, model) for column in nearby.jacobian(parameters)]
     with torch.enable_grad():
-        images = model.detach().clone().requires_grad_()
-        (slope,) = torch.autograd.grad(misfit(images), images)
+        leaf = model.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(misfit(leaf), leaf)
     curvature = misfit.curvature(model)
     # per image: the products of its directions (prism, focus, direction, direction), and their slopes
-    products = [torch.stack([_sums(a * curvature, b) for b in differences], -1) for a in differences]
-    gram, slopes = torch.stack(products, -2), torch.stack([_sums(slope, a) for a in differences], -1)
+    products = [torch.stack([_sums(a * curvature, b) for b in columns], -1) for a in columns]
+    gram, slopes = torch.stack(products, -2), torch.stack([_sums(slope, a) for a in columns], -1)
 
-    # from the parameters, in their scales, to the directions in units of the differences' steps
-    acting, scale = _acting(unknowns, parameters, (model.shape[0], model.shape[1]))
+    # from the parameters in their scales to the directions in their steps
+    acting, scale = _acting(nearby.unknowns, parameters, (model.shape[0], model.shape[1]))
     acting = acting * SCALE
     hessian = acting.mT @ (gram @ acting.unflatten(0, gram.shape[:3])).flatten(0, 2)
-    gradient = acting.mT @ slopes.flatten()
     damped = hessian + torch.diag(RELATIVE * hessian.diagonal() + ABSOLUTE)
-    step = -torch.linalg.solve(damped, gradient)
-    step = step * scale * min(1.0, LONGEST / max(float(step.abs().max()), 1e-300))
-    parts = step.split([parameters[u.name].numel() for u in unknowns])
-    return {
-        u.name: part.reshape(parameters[u.name].shape).to(parameters[u.name])
-        for u, part in zip(unknowns, parts, strict=True)
+    step = -torch.linalg.solve(damped, acting.mT @ slopes.flatten())
+    parts = (step * scale).split([part.numel() for part in parameters.values()])
+    shaped = {
+        name: part.reshape(parameter.shape).to(parameter)
+        for (name, parameter), part in zip(parameters.items(), parts, strict=True)
     }
+    return shaped, float(step.abs().max())
+
+
+def _lowered(nearby: Nearby, parameters: Parameters, step: Parameters, misfit: Misfit) -> Parameters | None:
+    """The parameters after the step, or a half, a quarter, … of it; None where all raise the nearby images' misfit."""
+    before = float(misfit(nearby.recorded(parameters)))
+    most = {u.name: LONGEST * SCALE * u.step for u in nearby.unknowns}
+    for halving in range(HALVINGS + 1):
+        tried = {}
+        for name, start in nearby.parameters.items():
+            away = parameters[name] + step[name] / 2**halving - start
+            tried[name] = start + away.clamp(-most[name], most[name])
+        if float(misfit(nearby.recorded(tried))) <= before:
+            return tried
+    return None
+
+
+def _judged(nearby: Nearby, found: Parameters, misfit: Misfit, fidelity: Fidelity) -> Parameters:
+    """What was found, or half of the way there, …, such that the misfit of newly formed images doesn't grow."""
+    start = nearby.parameters
+    before = float(misfit(nearby.recorded(start)))
+    for halving in range(HALVINGS + 1):
+        tried = {name: part + (found[name] - part) / 2**halving for name, part in start.items()}
+        if float(misfit(nearby.placed(tried).images(fidelity))) <= before:
+            return tried
+    return dict(start)
+
+
+def _told_from_rounding(difference: Tensor, model: Tensor) -> Tensor:
+    """The difference of images, 0 where it is no more than their rounding, as that by drift without contrast."""
+    rounding = ROUNDING * torch.finfo(model.dtype).eps * _sums(model, model).sqrt()
+    return torch.where((_sums(difference, difference).sqrt() > rounding)[..., None, None], difference, 0)
 
 
 def _acting(

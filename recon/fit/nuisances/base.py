@@ -13,8 +13,8 @@ class Nuisance(Unknown):
 
     Adam moves it as any unknown, and `recon.fit.scalars.refined` by Gauss and Newton, with differences of images. A
     subclass is a frozen dataclass with these fields, whose first value suits a well-aligned microscope:
-    learning_rate: Adam's first, in the parameter's unit. step: of the differences, in the parameter's unit; a hundred
-    of them are an error that would be large. Raises ValueError unless both are above 0.
+    learning_rate: Adam's first, in the parameter's unit. step: of the differences, in the parameter's unit; ten of
+    them are a large error. Raises ValueError unless both are above 0.
 
     and says of its parameter:
     axes: the images' axes that its first axes are. An entry acts on the images of its own prism, or plane, alone, so

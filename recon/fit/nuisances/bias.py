@@ -24,7 +24,7 @@ class Bias(Nuisance):
     """
 
     learning_rate: float = 0.02
-    step: float = 1e-3
+    step: float = 0.03
     name = "bias"
     axes = ("prism",)
 
@@ -47,7 +47,7 @@ class CommonBias(Nuisance):
     """
 
     learning_rate: float = 0.02
-    step: float = 1e-3
+    step: float = 0.03
     name = "bias"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:

@@ -18,7 +18,7 @@ class Drift(Nuisance):
     """
 
     learning_rate: float = 5e-3
-    step: float = 2e-3
+    step: float = 0.02
     name = "drift"
     axes = ("prism", "focus")
     centred = True

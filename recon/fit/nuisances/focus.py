@@ -19,7 +19,7 @@ class FocusErrors(Nuisance):
     """
 
     learning_rate: float = 0.02
-    step: float = 5e-3
+    step: float = 0.05
     name = "focus"
     axes = ("focus",)
     centred = True

@@ -24,7 +24,7 @@ class ShearError(Nuisance):
     """
 
     learning_rate: float = 2e-3
-    step: float = 2e-3
+    step: float = 0.02
     name = "shear"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:
