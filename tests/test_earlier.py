@@ -328,6 +328,9 @@ def test_bad_input_is_refused_in_one_line(method):
     camera = Microscope(0.546, Objective(0.8), Condenser(0.5), Camera(pixel_size=0.2))
     with pytest.raises(ValueError, match=r"camera.pixel_size 0.2 µm: the model's pixels are its volume's voxels"):
         method(data, replace(setup, microscope=camera), 1e-4)
+    for name, value in (("brightness", torch.ones(2, 5)), ("drift", torch.zeros(2, 5, 2)), ("margin", 2)):
+        with pytest.raises(ValueError, match=f"the setup has a {name}, of which the earlier models know nothing"):
+            method(data, replace(setup, **{name: value}), 1e-4)
 
 
 # --- the thin phase object -------------------------------------------------------------------------------------------

@@ -5,18 +5,23 @@ from dataclasses import replace
 import pytest
 import torch
 from absolute import Absolute
+from distant import Device, bring, send
 
 from data_synthetic import GaussianBall
 from recon.fit import scalars
+from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
 from recon.fit.nuisances.bias import Bias, CommonBias
 from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
 from recon.fit.nuisances.nearby import Nearby
 from recon.fit.nuisances.shear import ShearError
+from recon.fit.planned import GivenFidelity
+from recon.fit.problem import Problem
 from recon.fit.scalars import best_brightness, refined
 from recon.fit.setup import Setup, empty_medium
-from recon.fit.unknowns import with_values
+from recon.fit.unknowns import IndexDifference, with_values
 from recon.misfit.gaussian import GaussianMisfit
 from recon.misfit.poisson import PoissonMisfit
 from recon.recording.noise import NoiseModel
@@ -352,3 +357,42 @@ def test_an_image_without_a_pixel_that_counts_has_a_brightness_of_1():
     found = best_brightness(setup().images(FIDELITY), GaussianMisfit(data, mask=mask))
     assert float(found[0, 1]) == 1
     assert float(found[0, 0]) == pytest.approx(1.02, rel=1e-6)
+
+
+# on another device
+
+
+def test_refinement_goes_there_as_here():
+    known = setup(acquisition=turned(), dtype=torch.float64, margin=3)
+    unknowns = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
+    data = setup(dtype=torch.float64, brightness=BRIGHTNESS, drift=DRIFT, margin=3).images(FIDELITY)
+    misfit = GaussianMisfit(data)
+    here = refined(unknowns, starts(unknowns, known, misfit), known, misfit, FIDELITY)
+    lit = best_brightness(known.images(FIDELITY), misfit)
+    with Device():
+        volume = Volume(GRID, send(known.volume.delta), BACKGROUND)
+        far, misfit = replace(known, volume=volume), GaussianMisfit(send(data))
+        there = refined(unknowns, starts(unknowns, far, misfit), far, misfit, FIDELITY)
+        lit_there = best_brightness(far.images(FIDELITY), misfit)
+    torch.testing.assert_close(bring(lit_there), lit, rtol=1e-9, atol=1e-12)
+    for name, value in there.items():
+        torch.testing.assert_close(bring(value), here[name], rtol=1e-6, atol=1e-9)
+
+
+def test_a_descent_of_nuisances_goes_there_as_here():
+    known = setup(acquisition=turned(), dtype=torch.float64, margin=3)
+    data = setup(dtype=torch.float64, brightness=BRIGHTNESS, drift=DRIFT, margin=3).images(FIDELITY)
+    unknowns = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
+
+    def descended(data):
+        scene = replace(known, volume=empty_medium(GRID, BACKGROUND, data))
+        delta = IndexDifference(5e-3, Bounds(), "linear")
+        problem = Problem(scene, GaussianMisfit(data), [delta, *unknowns], [], GivenFidelity(FIDELITY), 2)
+        *_, last = minimise(problem)
+        return last.values
+
+    here = descended(data)
+    with Device():
+        there = descended(send(data))
+    for name, value in there.items():
+        torch.testing.assert_close(bring(value), here[name], rtol=1e-6, atol=1e-9)

@@ -23,7 +23,7 @@ SCALE, LONGEST = 10.0, 1.5
 # Damping: a share of the Hessian's diagonal, and a curvature per scale² that holds what the images say nothing of.
 RELATIVE, ABSOLUTE = 1e-7, 1e-6
 # Steps on the nearby images, fewer once they are shorter than this many scales.
-STEPS, SHORT = 5, 1e-4
+STEPS, SHORT = 5, 1e-3
 # How often a step that raises the misfit is halved before it is given up.
 HALVINGS = 4
 # Differences of images of less than this many times their dtype's eps are those of rounding.

@@ -85,9 +85,7 @@ def _at_border(images: Float[np.ndarray, "focus y x"], noise: float) -> bool:
 def _block_medians(contrast: Float[np.ndarray, "focus y x"]) -> Float[np.ndarray, "focus row column"]:
     """The magnitude of each block's median; the last blocks end at the image's last pixels."""
     planes, ny, nx = contrast.shape
-    rows, columns = (
-        np.unique([*range(0, n - side + 1, side), n - side]) for n, side in ((ny, _WIDTH), (nx, _LENGTH))
-    )
+    rows, columns = (np.unique([*range(0, n - side + 1, side), n - side]) for n, side in ((ny, _WIDTH), (nx, _LENGTH)))
     windows = np.lib.stride_tricks.sliding_window_view(contrast, (_WIDTH, _LENGTH), axis=(1, 2))
     blocks = windows[:, rows][:, :, columns].reshape(planes, len(rows), len(columns), -1)
     return np.abs(np.median(blocks, axis=-1))
