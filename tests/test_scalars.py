@@ -166,9 +166,18 @@ def test_prisms_are_moved_with_one_propagation(propagations):
     assert propagations == [2, 2 * 2, 2, 2]  # the given images, biases, planes, the try
 
 
+def test_where_everything_is_found_no_try_is_formed(propagations):
+    misfit, known = GaussianMisfit(setup().images(FIDELITY)), setup()
+    propagations.clear()
+    start = starts([Bias()], known, misfit)
+    found = refined([Bias()], start, known, misfit, FIDELITY)
+    assert propagations == [2 * 3]
+    assert torch.equal(found["bias"], start["bias"])
+
+
 def test_nothing_is_differentiated_and_nothing_given_is_changed():
     data = setup(brightness=BRIGHTNESS).images(FIDELITY)
-    misfit, known, unknowns = GaussianMisfit(data), setup(), [Brightness(), Bias()]
+    misfit, known, unknowns = GaussianMisfit(data), setup(acquisition=turned()), [Brightness(), Bias()]
     known = replace(known, volume=Volume(GRID, known.volume.delta.requires_grad_(), BACKGROUND))
     start = {name: part.requires_grad_() for name, part in starts(unknowns, known, misfit).items()}
     before = {name: part.detach().clone() for name, part in start.items()}

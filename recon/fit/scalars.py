@@ -22,7 +22,7 @@ from torchdic import Fidelity
 SCALE, LONGEST = 10.0, 1.5
 # Damping: a share of the Hessian's diagonal, and a curvature per scale² that holds what the images say nothing of.
 RELATIVE, ABSOLUTE = 1e-7, 1e-6
-# Steps on the nearby images, fewer once they are shorter than this many scales.
+# Steps on the nearby images, fewer once they are shorter than this many scales; so short a way isn't gone at all.
 STEPS, SHORT = 5, 1e-3
 # How often a step that raises the misfit is halved before it is given up.
 HALVINGS = 4
@@ -123,6 +123,9 @@ def _lowered(nearby: Nearby, parameters: Parameters, step: Parameters, misfit: M
 def _judged(nearby: Nearby, found: Parameters, misfit: Misfit, fidelity: Fidelity) -> Parameters:
     """What was found, or half of the way there, …, such that the misfit of newly formed images doesn't grow."""
     start = nearby.parameters
+    scales = {u.name: SCALE * u.step for u in nearby.unknowns}
+    if max(float((found[name] - part).abs().max()) / scales[name] for name, part in start.items()) < SHORT:
+        return dict(start)  # new images would tell their rounding alone
     before = float(misfit(nearby.recorded(start)))
     for halving in range(HALVINGS + 1):
         tried = {name: part + (found[name] - part) / 2**halving for name, part in start.items()}

@@ -17,7 +17,7 @@ class Brightness(Nuisance):
     """
 
     learning_rate: float = 2e-3
-    step: float = 0.01
+    step: float = 0.03
     name = "brightness"
     axes = ("prism", "focus")
     forms = False
