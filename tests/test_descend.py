@@ -12,7 +12,7 @@ from recon.fit.bounds import Bounds
 from recon.fit.descent import descend, minimise
 from recon.fit.prior import total_variation
 from recon.fit.problem import Problem, Recipe
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.report.metrics import mean_inside, residual_rms, volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError

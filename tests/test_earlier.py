@@ -1,6 +1,7 @@
 """Earlier models invert their own images: the weak specimen, and the thin phase object of each section."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from recon.earlier.phase_difference import phase_differences
 from recon.earlier.tikhonov import FREE, LinearModel, tikhonov
 from recon.earlier.weight import Components, choose_weight, cross_validated
 from recon.fit.bounds import Bounds
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.background import noise_level
 from recon.report.metrics import volume_error
@@ -129,7 +130,7 @@ def test_robust_cross_validation_weighs_more_than_the_plain_one():
 
 
 def model_of(data, setup):
-    volume, microscope, acquisition = setup
+    volume, microscope, acquisition = setup.volume, setup.microscope, setup.acquisition
     fidelity = Fidelity("wave", sources=SOURCES)
     T = transfer_functions(volume.grid, microscope, acquisition, N0, fidelity, dtype=data.dtype)
     scale = GaussianMisfit(data).variance.rsqrt()
@@ -304,14 +305,14 @@ def test_a_weak_specimen_is_not_sought_where_there_is_no_linear_response():
     data, setup = linear_data(two_balls(), 1e-4)
     microscope = Microscope(0.546, Objective(0.8), Condenser(0.5), condenser_prism=False)
     with pytest.raises(ValueError, match="it needs a condenser prism"):
-        tikhonov(data, setup._replace(microscope=microscope), 1e-4)
+        tikhonov(data, replace(setup, microscope=microscope), 1e-4)
     strained = Polarisation(pupil=JonesPupil(retardance={4: (0.3, 0.0)}))
     microscope = Microscope(0.546, Objective(0.8), Condenser(0.5), polarisation=strained)
     with pytest.raises(ValueError, match="can't hold a polarisation pupil"):
-        tikhonov(data, setup._replace(microscope=microscope), 1e-4)
+        tikhonov(data, replace(setup, microscope=microscope), 1e-4)
     unbiased = Acquisition((PRISMS[0], Prism((0.2, 0.0), 2 * math.pi)), FOCUS)
     with pytest.raises(ValueError, match=r"prism 1 \(bias 6.28319\) has no linear response"):
-        tikhonov(data, setup._replace(acquisition=unbiased), 1e-4)
+        tikhonov(data, replace(setup, acquisition=unbiased), 1e-4)
 
 
 @pytest.mark.parametrize("method", [tikhonov, path_length])
@@ -326,7 +327,10 @@ def test_bad_input_is_refused_in_one_line(method):
             method(data, setup, noise)
     camera = Microscope(0.546, Objective(0.8), Condenser(0.5), Camera(pixel_size=0.2))
     with pytest.raises(ValueError, match=r"camera.pixel_size 0.2 µm: the model's pixels are its volume's voxels"):
-        method(data, setup._replace(microscope=camera), 1e-4)
+        method(data, replace(setup, microscope=camera), 1e-4)
+    for name, value in (("brightness", torch.ones(2, 5)), ("drift", torch.zeros(2, 5, 2)), ("margin", 2)):
+        with pytest.raises(ValueError, match=f"the setup has a {name}, of which the earlier models know nothing"):
+            method(data, replace(setup, **{name: value}), 1e-4)
 
 
 # --- the thin phase object -------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from recon.cli import main
 from recon.config.conversion import dump
 from recon.config.reading import load
 from recon.fit.planned import GROWTH, current, follow, strength
-from recon.fit.unknowns import Setup
+from recon.fit.setup import Setup
 from recon.run import recorded
 from torchdic import (
     REFERENCE,

@@ -7,12 +7,19 @@ import torch
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
+from recon.fit.nuisances.bias import Bias
+from recon.fit.nuisances.brightness import Brightness
+from recon.fit.nuisances.drift import Drift
+from recon.fit.nuisances.focus import FocusErrors
+from recon.fit.nuisances.shear import ShearError
 from recon.fit.problem import Problem, Recipe
-from recon.fit.unknowns import IndexDifference, Setup, Unknown, Unknowns, empty_medium
+from recon.fit.setup import Setup, empty_medium
+from recon.fit.unknowns import IndexDifference, Unknown, Unknowns
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report.metrics import volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint
+from recon.run.room import held_beside_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 BACKGROUND = 1.5
@@ -36,7 +43,7 @@ class BiasOffset(Unknown):
 
     def put(self, value, setup):
         prisms = [replace(prism, bias=prism.bias + value) for prism in setup.acquisition.prisms]
-        return setup._replace(acquisition=Acquisition(prisms, setup.acquisition.focus))
+        return replace(setup, acquisition=Acquisition(prisms, setup.acquisition.focus))
 
 
 @pytest.fixture
@@ -128,7 +135,8 @@ def test_the_bias_alone_is_found_where_the_volume_is_known(data, truth):
 def test_values_are_put_where_they_belong_and_keep_their_graph(data):
     two = problem(data, DECLARED, BiasOffset(0.05))
     unknowns = Unknowns.at_start(two.unknowns, two.setup, two.misfit)
-    volume, microscope, acquisition = unknowns.into(two.setup)
+    put = unknowns.into(two.setup)
+    volume, microscope, acquisition = put.volume, put.microscope, put.acquisition
     assert volume.delta.requires_grad
     assert torch.equal(volume.delta.detach(), unknowns.values()["delta"])
     assert microscope is MICROSCOPE
@@ -152,3 +160,80 @@ def test_a_known_absorption_stays_where_delta_is_put(data):
 def test_an_empty_medium_takes_no_memory_for_its_voxels():
     medium = empty_medium(Grid((100, 100, 100), (0.5, 0.2, 0.2)), BACKGROUND, torch.zeros(1, dtype=torch.float64))
     assert medium.delta.untyped_storage().nbytes() == 8
+
+
+# what is learned beside Δn
+
+
+BRIGHTNESS = torch.tensor([[1.02, 0.985, 1.01], [0.98, 1.015, 0.99]])
+DRIFT = torch.tensor([[[0.1, -0.06], [-0.04, 0.1], [-0.08, 0.0]], [[0.06, 0.05], [-0.1, -0.02], [0.06, -0.07]]])
+NUISANCES = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
+
+
+def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth):
+    known = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, BRIGHTNESS, DRIFT)
+    with torch.no_grad():
+        data = known.images(FIDELITY)
+    *_, wrong = minimise(problem(data, DECLARED))
+    *_, learned = minimise(problem(data, DECLARED, Bias(), Brightness(), Drift(), steps=80))
+    assert learned.misfit < 0.2 * wrong.misfit
+    assert volume_error(learned.delta, truth) < 0.5 * volume_error(wrong.delta, truth)
+    assert float((learned.values["bias"] - torch.tensor([1.5, -1.2])).abs().max()) < 0.25 * OFF
+    assert float((learned.values["drift"] - DRIFT).abs().max()) < 0.04
+    assert learned.values["brightness"].shape == (2, 3)
+
+
+def test_a_descent_of_everything_goes_on_from_disk_bit_for_bit(data, tmp_path):
+    everything = problem(data, DECLARED, *NUISANCES, steps=6)
+    steps = list(minimise(everything))
+    assert set(steps[-1].values) == {"delta", "bias", "brightness", "drift", "focus", "shear"}
+    for step in steps[0], steps[3]:
+        checkpoint.save(tmp_path / "checkpoint.pt", Checkpoint(step, [], ""))
+        again = checkpoint.load(tmp_path / "checkpoint.pt", "").step
+        assert alike(again, step)
+        rest = list(minimise(everything, again))
+        assert all(alike(a, b) for a, b in zip(rest, steps[step.number :], strict=True))
+
+
+@pytest.mark.parametrize("unknown", NUISANCES, ids=lambda unknown: unknown.name)
+def test_adams_first_step_is_as_long_as_the_nuisances_rate(unknown, data, truth):
+    """Beside the true volume; the images of an empty one hardly change with it."""
+    setup = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, DECLARED)
+    alone = replace(problem(data, DECLARED), setup=setup, unknowns=[unknown], priors=[])
+    parameter = next(minimise(alone)).state[unknown.name]["parameter"]
+    moved = (parameter - unknown.start(setup, alone.misfit)).abs()
+    assert float(moved.max()) == pytest.approx(unknown.learning_rate, rel=1e-3)
+
+
+def test_a_volume_with_a_margin_descends(truth):
+    """Data of the middle of the true volume; the wide one explains them, beside a drift."""
+    wide = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, drift=DRIFT, margin=2)
+    with torch.no_grad():
+        data = wide.images(FIDELITY)
+    setup = replace(wide, volume=empty_medium(GRID, BACKGROUND, data), drift=None)
+    recipe = Recipe(steps=40, start="linear", tv=(20.0, 5.0), draft_sources=None)
+    made = Problem.from_recipe(data, setup, FIDELITY, recipe)
+    *_, last = minimise(replace(made, unknowns=[*made.unknowns, Drift()]))
+    assert last.delta.shape == GRID.shape
+    assert last.misfit < 0.1
+    assert float((last.values["drift"] - DRIFT).abs().max()) < 0.05
+
+
+def test_room_is_found_for_what_drift_and_brightness_hold(data):
+    """More than Δn alone asks for; nothing but few numbers for those of the prisms."""
+    alone = problem(data, DECLARED)
+    held = {
+        names: held_beside_images(problem(data, DECLARED, *more), GaussianMisfit, FIDELITY)
+        for names, more in (("drift", [Brightness(), Drift()]), ("bias", [Bias()]))
+    }
+    without = held_beside_images(alone, GaussianMisfit, FIDELITY)
+    # an image's spectrum, 8 bytes for half the pixels of each image, at the least
+    assert held["drift"] >= without + 8 * data.numel() // 2
+    assert held["bias"] == pytest.approx(without, abs=4096)
+
+
+def test_room_is_found_for_a_problem_with_a_margin(data):
+    made = problem(data, TRUE)
+    setup = replace(made.setup, volume=empty_medium(GRID.widened(3, 3), BACKGROUND, data), margin=3)
+    wide = held_beside_images(replace(made, setup=setup), GaussianMisfit, FIDELITY)
+    assert wide > held_beside_images(made, GaussianMisfit, FIDELITY)

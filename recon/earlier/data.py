@@ -5,13 +5,16 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from recon.fit.unknowns import Setup
+from recon.fit.setup import Setup
 
 
 def check_images(data: Tensor, setup: Setup) -> None:
-    """Raise ValueError where the data aren't the setup's images, one value per voxel column."""
-    volume, microscope, acquisition = setup
-    expected = (len(acquisition.prisms), len(acquisition.focus), *volume.grid.shape[1:])
+    """Raise ValueError where the data aren't the setup's images, one value per voxel column, or the setup has more."""
+    acquisition, microscope = setup.acquisition, setup.microscope
+    for name, value in (("brightness", setup.brightness), ("drift", setup.drift), ("margin", setup.margin or None)):
+        if value is not None:
+            raise ValueError(f"the setup has a {name}, of which the earlier models know nothing")
+    expected = (len(acquisition.prisms), len(acquisition.focus), *setup.volume.grid.shape[1:])
     if tuple(data.shape) != expected:
         raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {expected}")
     if microscope.camera is not None and microscope.camera.pixel_size is not None:

@@ -24,7 +24,7 @@ from torch import Tensor
 from recon.earlier.data import check_images, noise_of_prisms
 from recon.earlier.phase_difference import PhaseDifference, phase_differences
 from recon.earlier.weight import Components, Rule, choose_weight
-from recon.fit.unknowns import Setup
+from recon.fit.setup import Setup
 from torchdic import Grid
 from torchdic.scalar import number
 
@@ -76,7 +76,7 @@ def path_length(
     `recon.earlier.phase_difference.phase_differences`.
     """
     check_images(data, setup)
-    volume, microscope, acquisition = setup
+    volume, microscope, acquisition = setup.volume, setup.microscope, setup.acquisition
     levels = noise_of_prisms(noise, len(data))
     variance = None if levels is None else sum(n**2 for n in levels) / len(levels)
     problem = Integration(volume.grid, phase_differences(data, acquisition.prisms))

@@ -20,7 +20,7 @@ from torch import Tensor
 from recon.earlier.data import check_images, noise_of_prisms
 from recon.earlier.weight import Components, Rule, choose_weight
 from recon.fit.bounds import Bounds
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Fidelity, Grid
 from torchdic.linear import linear_image, transfer_functions
@@ -123,7 +123,7 @@ def tikhonov(
     Raises ValueError for data of another shape than the setup's, camera pixels other than voxels, a prism without a
     linear response (a bias of 0), and as `torchdic.linear.transfer_functions` where none exists.
     """
-    volume, microscope, acquisition = setup
+    volume, microscope, acquisition = setup.volume, setup.microscope, setup.acquisition
     check_images(data, setup)
     misfit = GaussianMisfit(data)
     levels = noise_of_prisms(noise, len(data))
@@ -145,7 +145,7 @@ def tikhonov(
 
 def _weighted_transfer(setup: Setup, fidelity: Fidelity, scale: Tensor) -> Complex[Tensor, "image z y half"]:
     """The transfer of every image times its prism's scale, for the frequencies of a real FFT."""
-    volume, microscope, acquisition = setup
+    volume, microscope, acquisition = setup.volume, setup.microscope, setup.acquisition
     grid = volume.grid
     transfer = transfer_functions(
         grid, microscope, acquisition, number(volume.background), fidelity, dtype=scale.dtype, device=scale.device

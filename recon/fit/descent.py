@@ -11,8 +11,9 @@ from torch import Tensor
 
 from recon.fit.planned import PlanRecord
 from recon.fit.problem import Problem, Recipe
-from recon.fit.unknowns import IndexDifference, Setup, State, Unknowns, empty_medium
-from torchdic import Acquisition, Fidelity, Grid, Microscope, image
+from recon.fit.setup import Setup, empty_medium
+from recon.fit.unknowns import IndexDifference, State, Unknowns
+from torchdic import Acquisition, Fidelity, Grid, Microscope
 from torchdic.errors import UnstableError
 
 # A step's row of the log: number, misfit, loss, seconds.
@@ -98,7 +99,7 @@ def _move(
     setup = unknowns.into(problem.setup)
     fidelity, plans = problem.fidelity.at(step, problem.steps, setup, plans)
     try:
-        images = image(*setup, fidelity)
+        images = setup.images(fidelity)
     except UnstableError as error:
         raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
     misfit = problem.misfit(images)

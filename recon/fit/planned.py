@@ -5,7 +5,7 @@ from typing import Any
 
 from torch import Tensor
 
-from recon.fit.unknowns import Setup
+from recon.fit.setup import Setup
 from torchdic import Fidelity, Grid, Plan, plan
 from torchdic.planning.plan import describe
 
@@ -84,11 +84,11 @@ def follow(plans: tuple[PlanRecord, ...], step: int, setup: Setup, tolerance: fl
 
     step: counted from 0. setup: with the current volume. tolerance: of the images.
     """
-    volume, microscope, acquisition = setup
+    volume, microscope = setup.volume, setup.microscope
     now = strength(volume.delta, volume.grid, microscope.wavelength)
     if plans and now < GROWTH * plans[-1]["strength"]:
         return plans
-    made = plan(volume, microscope, acquisition, tolerance)
+    made = plan(volume, microscope, setup.acquisition, tolerance)
     record = {
         "step": step + 1,
         "strength": now,

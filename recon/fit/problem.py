@@ -10,7 +10,8 @@ from torch import Tensor
 from recon.fit.bounds import Bounds
 from recon.fit.planned import GivenFidelity, PlannedFidelity
 from recon.fit.prior import Magnitude, Prior, TotalVariation
-from recon.fit.unknowns import IndexDifference, Setup, Unknown
+from recon.fit.setup import Setup
+from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Fidelity
@@ -55,7 +56,7 @@ class Problem:
     setup: the volume, microscope and acquisition as far as they are known; the unknowns replace parts of it.
     misfit: holds the measured images. unknowns: what is sought. priors: what is added to the misfit, in this order.
     fidelity: of the images at each step. steps: how many there are.
-    Raises ValueError where the data's shape is not the acquisition's and the grid's, or two unknowns share a name.
+    Raises ValueError where the data's shape is not that of the setup's images, or two unknowns share a name.
     """
 
     setup: Setup
@@ -66,9 +67,7 @@ class Problem:
     steps: int
 
     def __post_init__(self) -> None:
-        volume, _, acquisition = self.setup
-        expected = (len(acquisition.prisms), len(acquisition.focus), *volume.grid.shape[1:])
-        found = tuple(self.misfit.data.shape)
+        expected, found = self.setup.shape, tuple(self.misfit.data.shape)
         if found != expected:
             raise ValueError(f"the data have shape {found}, the acquisition and grid ask for {expected}")
         names = [unknown.name for unknown in self.unknowns]

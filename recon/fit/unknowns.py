@@ -7,36 +7,25 @@ and where in the model's setup the quantity goes. `Unknowns` are the unknowns of
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
 from recon.fit.schedule import cosine
+from recon.fit.setup import Setup
 from recon.fit.start import linear_start
 from recon.misfit.base import Misfit
-from torchdic import Acquisition, Grid, Microscope, Volume
+from torchdic import Volume
 
 # Distance in Δn from its bounds that every voxel starts with.
 OFF_BOUNDS = 1e-3
 
 # What goes on from one step to the next: of each unknown, by its name, the parameter and Adam's moments.
 State = dict[str, dict[str, Any]]
-
-
-class Setup(NamedTuple):
-    """What images are computed from: `image(*setup, fidelity)`."""
-
-    volume: Volume
-    microscope: Microscope
-    acquisition: Acquisition
-
-
-def empty_medium(grid: Grid, background: float, like: Tensor) -> Volume:
-    """A volume of Δn = 0 that takes no memory. background: the medium's index. like: gives the dtype and device."""
-    return Volume(grid, like.new_zeros(()).expand(grid.shape), background)
 
 
 class Unknown(ABC):
@@ -81,12 +70,12 @@ class IndexDifference(Unknown):
     name = "delta"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:
-        """The parameter of the first volume, OFF_BOUNDS away from the bounds."""
-        volume, microscope, acquisition = setup
-        if self.first == "linear":
-            delta = linear_start(misfit.data, volume.grid, volume.background, microscope, acquisition)
-        else:
-            delta = misfit.data.new_zeros(volume.grid.shape)
+        """The parameter of the first volume, OFF_BOUNDS away from the bounds.
+
+        Raises ValueError for a linear start from images whose pixels aren't voxels.
+        """
+        zero = misfit.data.new_zeros(()).expand(setup.volume.grid.shape)
+        delta = _linear(setup, misfit) if self.first == "linear" else zero
         return self.bounds.parameter(delta, margin=OFF_BOUNDS)
 
     def value(self, parameter: Tensor) -> Tensor:
@@ -96,7 +85,16 @@ class IndexDifference(Unknown):
     def put(self, value: Tensor, setup: Setup) -> Setup:
         """The setup with a volume of this Δn; its background and absorption stay."""
         known = setup.volume
-        return setup._replace(volume=Volume(known.grid, value, known.background, known.absorption))
+        return replace(setup, volume=Volume(known.grid, value, known.background, known.absorption))
+
+
+def _linear(setup: Setup, misfit: Misfit) -> Tensor:
+    """Δn of the weak specimen within the field; in the margin it goes on as at the field's edge."""
+    if not setup.sees_voxels:
+        raise ValueError("a linear start asks for images whose pixels are voxels, the camera has a pixel_size")
+    data, margin = setup.at_rest(misfit.data), setup.margin
+    delta = linear_start(data, setup.field, setup.volume.background, setup.microscope, setup.acquisition)
+    return delta if margin == 0 else F.pad(delta[None], (margin,) * 4, mode="replicate")[0]
 
 
 def with_values(unknowns: Sequence[Unknown], values: Mapping[str, Tensor], setup: Setup) -> Setup:

@@ -11,7 +11,7 @@ from torch import Tensor
 from recon.config.conversion import flat
 from recon.config.schema import Config, ConfigError, SimulationSection
 from recon.fit.problem import Problem
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.preparation import Measured

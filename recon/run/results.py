@@ -19,7 +19,6 @@ from recon.recording.preparation import Measured, PrismReport
 from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.run.checkpoint import Checkpoint
-from torchdic import image
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json, write_text
 
@@ -40,7 +39,7 @@ class Result:
 def model_images(problem: Problem, last: Step) -> Float[Tensor, "prism focus y x"]:
     """The images of a descent's last step, computed with its last fidelity."""
     values = {name: value.to(problem.misfit.data.device) for name, value in last.values.items()}
-    return image(*with_values(problem.unknowns, values, problem.setup), problem.fidelity.last(last.plans))
+    return with_values(problem.unknowns, values, problem.setup).images(problem.fidelity.last(last.plans))
 
 
 def metrics(
@@ -83,7 +82,7 @@ def warn_of_poor_fit(misfit: float) -> None:
 
 def write_results(out: Path, config: Config, measured: Measured, problem: Problem, ended: Checkpoint) -> Result:
     """Write a finished descent's volume, metrics, resolved configuration and figures into a folder."""
-    last, grid = ended.step, config.volume.grid
+    last, grid = ended.step, problem.setup.volume.grid
     images, data, delta = model_images(problem, last), problem.misfit.data.cpu(), last.delta.cpu()
     found = metrics(problem, last, images, measured.prisms)
     warn_of_poor_fit(found["misfit"])
@@ -91,7 +90,7 @@ def write_results(out: Path, config: Config, measured: Measured, problem: Proble
     comments = "".join(f"# {announce_record(record)}\n" for record in last.plans)
     write_text(out / "config.resolved.toml", comments + dump(config))
     write_json(out / "metrics.json", found)
-    drawn = figures.draw_images(data, images.cpu(), config.acquisition.prisms, measured.focus, grid)
+    drawn = figures.draw_images(data, images.cpu(), config.acquisition.prisms, measured.focus, problem.setup.field)
     figures.save(drawn, out / "images.png")
     figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
     figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")

@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.fit.descent import minimise
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
-from recon.fit.unknowns import Setup, empty_medium
+from recon.fit.setup import empty_medium
 from recon.misfit.base import Misfit
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
 from torchdic.forward.foresee import AMPLE
@@ -43,17 +43,17 @@ def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit])
     free = free_bytes(data.device)
     if free is None or _ample(problem) <= free:
         return
-    images = foreseen(*problem.setup, fidelity, gradient=True).least
+    setup = problem.setup
+    images = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least
     wanted = images + held_beside_images(problem, misfit, fidelity)
-    shape = "×".join(map(str, problem.setup.volume.grid.shape))
+    shape = "×".join(map(str, setup.volume.grid.shape))
     check_room(wanted, free, f"Steps of a reconstruction of {shape} voxels")
 
 
 def _ample(problem: Problem) -> int:
     """More bytes than any descent by single sources needs: what fits even so need not be measured."""
-    volume, _, acquisition = problem.setup
-    slices, *sides = volume.grid.shape
-    images = len(acquisition.prisms) * len(acquisition.focus)
+    slices, *sides = problem.setup.volume.grid.shape
+    images = math.prod(problem.setup.shape[:2])
     return math.prod(sides) * (slices + images) * (AMPLE + LINEAR * slices)
 
 
@@ -61,16 +61,17 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     """Bytes that a descent holds beside an image and its gradient: measured on few pixels, scaled to the problem's.
 
     They are those of the unknowns and what they are made of, Adam's moments, the priors, the steps that are handed out,
-    and the start.
+    and the start. The sample has no margin: its images are as large as the volume, at least as large as the problem's.
     """
-    grid = problem.setup.volume.grid
+    known, dtype = problem.setup, problem.misfit.data.dtype
+    grid = known.volume.grid
     few = replace(grid, shape=(grid.shape[0], *(min(n, SIDE) for n in grid.shape[1:])))
-    shape = *problem.misfit.data.shape[:2], *few.shape[1:]
+    medium = empty_medium(few, float(known.volume.background), torch.zeros((), dtype=dtype))
+    microscope = stand_in(_of_one_source(known.microscope))
+    recording = {"brightness": stand_in(known.brightness), "drift": stand_in(known.drift), "margin": 0}
+    setup = replace(known, volume=medium, microscope=microscope, acquisition=stand_in(known.acquisition), **recording)
     # values play no part, but images of one brightness are refused
-    data = torch.rand(shape, dtype=problem.misfit.data.dtype, generator=torch.Generator().manual_seed(0))
-    medium = empty_medium(few, float(problem.setup.volume.background), data)
-    microscope = stand_in(_of_one_source(problem.setup.microscope))
-    setup = Setup(medium, microscope, stand_in(problem.setup.acquisition))
+    data = torch.rand(setup.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
     ample = replace(fidelity, memory=1 << 62)
     sample = replace(problem, setup=setup, misfit=misfit(data), fidelity=GivenFidelity(ample), steps=STEPS)
 
@@ -81,7 +82,7 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
         del last
 
     def compute_image() -> None:
-        learned = torch.zeros(few.shape, dtype=data.dtype, requires_grad=True)
+        learned = torch.zeros(few.shape, dtype=dtype, requires_grad=True)
         volume = Volume(few, learned, medium.background)
         image(volume, microscope, setup.acquisition, ample).sum().backward()
 

@@ -1,0 +1,39 @@
+"""The brightness of each image: a lamp that isn't steady, or exposures that differ."""
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from recon.fit.nuisances.base import Nuisance
+from recon.fit.setup import Setup
+from recon.misfit.base import Misfit
+
+
+@dataclass(frozen=True)
+class Brightness(Nuisance):
+    """The factor of each image (prism, focus). Its parameter is the factor's logarithm.
+
+    learning_rate, step: of the logarithm.
+    """
+
+    learning_rate: float = 2e-3
+    step: float = 0.03
+    name = "brightness"
+    axes = ("prism", "focus")
+    forms = False
+
+    def start(self, setup: Setup, misfit: Misfit) -> Tensor:
+        """The logarithm of the setup's brightness, or of 1. Raises ValueError unless that is above 0."""
+        if setup.brightness is None:
+            return misfit.data.new_zeros(misfit.data.shape[:2])
+        if not bool((setup.brightness > 0).all()):
+            raise ValueError(f"brightness {float(setup.brightness.min()):g} must be above 0")
+        return setup.brightness.detach().to(misfit.data).log()
+
+    def of_entries(self, entries: Tensor) -> Tensor:
+        """The factors."""
+        return entries.exp()
+
+    def put(self, value: Tensor, setup: Setup) -> Setup:
+        """The setup with this brightness."""
+        return replace(setup, brightness=value)

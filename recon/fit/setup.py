@@ -1,0 +1,127 @@
+"""What images are computed from: the specimen, the microscope, what was recorded, and how it was recorded."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """The specimen, the microscope and the acquisition, as far as they are known, and what the recording did to them.
+
+    brightness: of each image (prism, focus), relative to what the model expects; None is 1.
+    drift: of each image (prism, focus, 2), µm (y, x): a positive one moves the specimen's picture towards +y and +x.
+    None is no drift.
+    margin: voxels by which the volume is wider than the field of the images on each side. Where the specimen goes on
+    beyond the field, a volume of the field's own size can't explain the images.
+
+    Brightness and drift may be learned. Raises ValueError where a shape isn't the acquisition's, or the margin is below
+    0 or leaves no field.
+    """
+
+    volume: Volume
+    microscope: Microscope
+    acquisition: Acquisition
+    brightness: Float[Tensor, "prism focus"] | None = None
+    drift: Float[Tensor, "prism focus 2"] | None = None
+    margin: int = 0
+
+    def __post_init__(self) -> None:
+        images = len(self.acquisition.prisms), len(self.acquisition.focus)
+        for name, value, expected in (("brightness", self.brightness, images), ("drift", self.drift, (*images, 2))):
+            if value is not None and tuple(value.shape) != expected:
+                raise ValueError(f"the {name} has shape {tuple(value.shape)}, the acquisition asks for {expected}")
+        sides = self.volume.grid.shape[1:]
+        if not (0 <= 2 * self.margin < min(sides)):
+            raise ValueError(
+                f"margin {self.margin} must be at least 0 and leave some of {sides[0]} × {sides[1]} voxels"
+            )
+
+    @property
+    def field(self) -> Grid:
+        """The volume's grid without the margin: the voxels behind the images."""
+        return self.volume.grid.widened(-self.margin, -self.margin)
+
+    @property
+    def sees_voxels(self) -> bool:
+        """Whether the images' pixels are voxels, not those of a camera."""
+        camera = self.microscope.camera
+        return camera is None or camera.pixel_size is None
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """The images' shape (prism, focus, y, x)."""
+        field, camera = self.field, self.microscope.camera
+        _, ny, nx = field.shape
+        _, dy, dx = field.spacing
+        rows, columns = (ny, nx) if camera is None else camera.pixels((ny, nx), (dy, dx))
+        return len(self.acquisition.prisms), len(self.acquisition.focus), rows, columns
+
+    def images(self, fidelity: Fidelity) -> Float[Tensor, "prism focus y x"]:
+        """The images, relative to the empty bright field, as `torchdic.image`; differentiable."""
+        if self.drift is None and self.margin == 0:
+            return self._lit(image(self.volume, self.microscope, self.acquisition, fidelity))
+        return self.recorded(self.formed(fidelity))
+
+    def formed(self, fidelity: Fidelity) -> Float[Tensor, "prism focus y x"]:
+        """The images that the microscope forms: on the voxels of the whole volume, without drift and brightness."""
+        microscope = self.microscope if self.sees_voxels else replace(self.microscope, camera=None)
+        return image(self.volume, microscope, self.acquisition, fidelity)
+
+    def recorded(self, formed: Float[Tensor, "prism focus row column"]) -> Float[Tensor, "prism focus y x"]:
+        """What is recorded of the images that the microscope forms: moved by the drift, within the field, lit."""
+        _, dy, dx = self.volume.grid.spacing
+        images = formed if self.drift is None else shifted(formed, self.drift, (dy, dx))
+        camera = self.microscope.camera
+        if camera is not None and not self.sees_voxels:
+            _, ny, nx = self.field.shape
+            images = camera.integrate(images, (dy, dx), (ny, nx))
+        elif self.margin > 0:
+            within = slice(self.margin, -self.margin)
+            images = images[..., within, within]
+        return self._lit(images)
+
+    def at_rest(self, data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, "prism focus y x"]:
+        """Recorded images as they would be without the drift and of brightness 1, on pixels that are voxels."""
+        _, dy, dx = self.volume.grid.spacing
+        images = data if self.drift is None else shifted(data, -self.drift, (dy, dx))
+        return images if self.brightness is None else images / self.brightness.to(images)[..., None, None]
+
+    def _lit(self, images: Tensor) -> Tensor:
+        return images if self.brightness is None else images * self.brightness.to(images)[..., None, None]
+
+
+def empty_medium(grid: Grid, background: float, like: Tensor) -> Volume:
+    """A volume of Δn = 0 that takes no memory. background: the medium's index. like: gives the dtype and device."""
+    return Volume(grid, like.new_zeros(()).expand(grid.shape), background)
+
+
+def shifted(
+    images: Float[Tensor, "prism focus y x"], by: Float[Tensor, "prism focus 2"], spacing: tuple[float, float]
+) -> Float[Tensor, "prism focus y x"]:
+    """Periodic images, each moved by its own distance (y, x) in µm: the trigonometric polynomial through its pixels.
+
+    spacing: of the pixels (y, x), µm. Differentiable in both.
+    """
+    ny, nx = images.shape[-2:]
+    by = by.to(images)
+    rows = _ramp(torch.fft.fftfreq(ny, spacing[0], dtype=torch.float64), by[..., :1], ny)
+    columns = _ramp(torch.fft.rfftfreq(nx, spacing[1], dtype=torch.float64), by[..., 1:], nx)
+    spectrum = torch.fft.rfft2(images) * rows[..., None] * columns[..., None, :]
+    return torch.fft.irfft2(spectrum, s=(ny, nx))
+
+
+def _ramp(frequencies: Tensor, by: Tensor, number: int) -> Tensor:
+    """exp(−2πi f·by) along one axis; at the Nyquist frequency its real part, the mean over f and −f."""
+    phase = -2 * math.pi * frequencies.to(by) * by
+    sine = phase.sin()
+    if number % 2 == 0:
+        known = torch.ones(len(frequencies), dtype=by.dtype, device=by.device)
+        known[number // 2] = 0
+        sine = sine * known
+    return torch.complex(phase.cos(), sine)
