@@ -159,7 +159,7 @@ def test_fields_are_as_small_as_their_intensities_allow(monkeypatch):
     grid = Grid((1, 160, 160), (1.0, 0.04, 0.04))
     scene = torch.ones(160, 160, dtype=torch.complex128), grid, MICROSCOPES["plain"], Acquisition()
     image_field(*scene, background=N0)  # whose memory has been measured then
-    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"])) or back(a, **k))
+    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"] or a.shape[-2:])) or back(a, **k))
     image_field(*scene, background=N0)
     # 2·8.79 bins across the pupil: 18, whose differences are 35
     assert sizes == [(35, 35)]

@@ -15,6 +15,9 @@ from torchdic.errors import BatchWarning
 
 T = TypeVar("T")
 
+# Bytes of an array that a core's second cache holds for the next operation. Half and twice as many were no faster.
+IN_CACHE = 1 << 20
+
 
 def recompute(function: Callable[..., T], *arguments: object, when: bool) -> T:
     """function(*arguments).
@@ -69,6 +72,17 @@ def slabs(steps: int, *, split: bool) -> Iterator[tuple[int, int]]:
     count = math.isqrt(steps - 1) + 1 if split else 1
     edges = [i * steps // count for i in range(count + 1)]
     yield from pairwise(edges)
+
+
+def in_cache(array: Tensor) -> list[slice]:
+    """Equal parts of an array's first axis, each of which a CPU's caches hold. Elsewhere it is a single part."""
+    count = len(array)
+    if array.device.type != "cpu":
+        return [slice(0, count)]
+    held = max(1, IN_CACHE * torch.get_num_threads() * count // (array.numel() * array.element_size()))
+    parts = math.ceil(count / held)
+    edges = [i * count // parts for i in range(parts + 1)]
+    return [slice(first, last) for first, last in pairwise(edges)]
 
 
 def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
