@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-from torchdic.memory.batches import in_cache
+from torchdic.memory.batches import in_cache, once
 from torchdic.plane_waves import to_field
 
 
@@ -50,7 +50,7 @@ class _Coherent(torch.autograd.Function):
         return images[..., 0] + images[..., 1]
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once
     def backward(ctx: Any, images_bar: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         S, E, weights, *transfers = ctx.saved_tensors
         (v, u), shape = S.shape[1:], images_bar.shape[1:]

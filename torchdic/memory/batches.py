@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import wraps
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -47,6 +48,21 @@ def replay(function: Callable[..., Tensor], *tensors: Tensor, when: bool) -> Ten
     return _Replayed.apply(function, *tensors)  # pyright: ignore[reportReturnType]
 
 
+def once(backward: Callable[..., T]) -> Callable[..., T]:
+    """A backward pass that has no derivative of its own: it raises RuntimeError where a second derivative is wanted.
+
+    torch's `once_differentiable` raises in some cases only, and in others leaves its part out of the second derivative.
+    """
+
+    @wraps(backward)
+    def first(ctx: Any, *bars: Tensor) -> T:
+        if torch.is_grad_enabled():
+            raise RuntimeError("this derivative is written out and has no second one: leave create_graph at False")
+        return backward(ctx, *bars)
+
+    return first
+
+
 class _Replayed(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
@@ -55,7 +71,7 @@ class _Replayed(torch.autograd.Function):
         return function(*tensors)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once
     def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         tensors = [t.detach().requires_grad_(t.requires_grad) for t in ctx.saved_tensors]
         with torch.enable_grad():

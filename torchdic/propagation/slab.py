@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Complex, Inexact
 from torch import Tensor
 
-from torchdic.memory.batches import in_cache
+from torchdic.memory.batches import in_cache, once
 from torchdic.plane_waves import exp_i, to_field, to_spectrum
 
 # How many consecutive sources have each screen in common; None where each source has its own.
@@ -64,7 +64,7 @@ class _FirstOrder(torch.autograd.Function):
         return result
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once
     def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         e, V, H, g, *kept = ctx.saved_tensors
         bar, weak, summed = result_bar.conj(), e - 1, torch.zeros_like(e)
@@ -98,7 +98,7 @@ class _SecondOrder(torch.autograd.Function):
         return result
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once
     def backward(ctx: Any, result_bar: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         e, i_phi, H, g, *kept = ctx.saved_tensors
         bar, summed, V_bar = result_bar.conj(), torch.zeros_like(e), torch.empty_like(H)
