@@ -13,7 +13,7 @@ from torchdic.errors import SlabWarning, UnstableError
 from torchdic.memory import batches
 from torchdic.plane_waves import axial_difference, to_field, to_spectrum
 from torchdic.propagation import split_step as split_module
-from torchdic.propagation.slab import cross_slab
+from torchdic.propagation.slab import Slab, cross_slab
 from torchdic.propagation.split_step import slab_mean, split_step
 
 N0 = 1.36
@@ -86,11 +86,12 @@ def test_sources_of_a_ring_share_their_screens(smooth_field):
 def test_derivative_of_a_slab_is_the_central_difference(monkeypatch, order, absorbs, screens, in_cache):
     """In each of its variables, whatever the parts in which sources are taken."""
     monkeypatch.setattr(batches, "IN_CACHE", in_cache)
-    phi = torch.rand(len(screens or [1] * 3), 4, 3, dtype=torch.complex128 if absorbs else torch.float64)
-    variables = [phi, *(torch.randn(3, 4, 3, dtype=torch.complex128) for _ in range(3))]
+    B = torch.rand(4, 3, dtype=torch.complex128 if absorbs else torch.float64)
+    pz0 = 1 + torch.rand(len(screens or [1] * 3), 1, 1, dtype=torch.float64)
+    variables = [B, pz0, *(torch.randn(3, 4, 3, dtype=torch.complex128) for _ in range(3))]
     for variable in variables:
         variable.requires_grad_()
-    assert torch.autograd.gradcheck(lambda *v: cross_slab(order, *v, screens), variables)
+    assert torch.autograd.gradcheck(lambda *v: cross_slab(Slab(order, 1.3, screens), *v), variables)
 
 
 def test_second_derivative_of_a_wave_is_refused():
