@@ -42,6 +42,7 @@ bench: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/scaling.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/thin_stack.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/whole.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/transforms.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/planner.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/on_gpu.py

@@ -147,8 +147,8 @@ def test_nothing_is_kept_where_nothing_is_learned(specimen, propagation):
 
 def test_a_learned_background_of_a_field_is_foreseen(monkeypatch):
     """Room for half of what its gradient holds: sources in batches bring it down."""
-    transmission = torch.polar(torch.ones(40, 48), 0.1 * torch.rand(40, 48))
-    grid = Grid((1, 40, 48), (1.0, 0.2, 0.21))
+    transmission = torch.polar(torch.ones(80, 96), 0.1 * torch.rand(80, 96))
+    grid = Grid((1, 80, 96), (1.0, 0.2, 0.21))
     background = torch.tensor(N0, requires_grad=True)
 
     def run(memory):

@@ -20,7 +20,9 @@ from torchdic import (
     image,
     image_field,
 )
+from torchdic.imaging.coherent import coherent_images
 from torchdic.imaging.passband import Passband, interpolate
+from torchdic.memory import batches
 
 WAVELENGTH, NA, N0 = 0.546, 0.75, 1.36
 POINTS = torch.tensor([[0.0, 0.0], [0.31, -0.12], [-0.7, 0.24], [0.05, -0.74]], dtype=torch.float64)
@@ -159,7 +161,7 @@ def test_fields_are_as_small_as_their_intensities_allow(monkeypatch):
     grid = Grid((1, 160, 160), (1.0, 0.04, 0.04))
     scene = torch.ones(160, 160, dtype=torch.complex128), grid, MICROSCOPES["plain"], Acquisition()
     image_field(*scene, background=N0)  # whose memory has been measured then
-    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"])) or back(a, **k))
+    monkeypatch.setattr(torch.fft, "ifft2", lambda a, **k: sizes.append(tuple(k["s"] or a.shape[-2:])) or back(a, **k))
     image_field(*scene, background=N0)
     # 2·8.79 bins across the pupil: 18, whose differences are 35
     assert sizes == [(35, 35)]
@@ -207,3 +209,20 @@ def test_dark_is_dark_on_a_coarse_array_too(dtype):
 def test_images_of_the_same_size_are_left_as_they_are():
     images = torch.rand(2, 3, 5, 6)
     assert interpolate(images, (5, 6)) is images
+
+
+@pytest.mark.parametrize("held", [1, 1 << 20], ids=["source by source", "at once"])
+@pytest.mark.parametrize("own", [True, False], ids=["transfer of each source", "transfer of all"])
+def test_derivative_of_coherent_images_is_the_central_difference(monkeypatch, own, held):
+    """In spectrum, defocus, weights and transfers, whatever the parts in which sources are taken."""
+    monkeypatch.setattr(batches, "IN_CACHE", held)
+    spectrum, defocus = (torch.randn(3, 4, 3, dtype=torch.complex128) for _ in range(2))
+    transfers = torch.randn(2, 3 if own else 1, 4, 3, dtype=torch.float64)
+    variables = [spectrum, defocus, torch.rand(3, dtype=torch.float64), transfers]
+    for variable in variables:
+        variable.requires_grad_()
+
+    def images(S, E, w, D):
+        return coherent_images(S, E, list(D.to(S.dtype)), w, (5, 6))
+
+    assert torch.autograd.gradcheck(images, variables)

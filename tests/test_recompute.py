@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from torchdic.errors import BatchWarning
-from torchdic.memory.batches import recompute, replay, slabs, sum_over_sources
+from torchdic.memory import batches
+from torchdic.memory.batches import in_cache, recompute, replay, slabs, sum_over_sources
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 4, 10, 17, 100])
@@ -70,6 +71,17 @@ def test_replayed_values_build_no_graph_and_leave_the_gradient_as_it_is():
     assert graphs == [True, False, True]
     with torch.no_grad():
         assert not replay(function, x, y, fixed, unused, when=True).requires_grad
+
+
+@pytest.mark.parametrize("bytes_held", [1, 100, 250, 1000])
+def test_parts_for_the_cache_are_even_and_follow_one_another(monkeypatch, bytes_held):
+    monkeypatch.setattr(batches, "IN_CACHE", bytes_held // torch.get_num_threads())
+    array = torch.zeros(7, 5, dtype=torch.complex64)  # 40 bytes each
+    parts = in_cache(array)
+    assert [i for part in parts for i in range(7)[part]] == list(range(7))
+    sizes = [len(array[part]) for part in parts]
+    assert max(sizes) <= max(1, bytes_held // 40)
+    assert max(sizes) - min(sizes) <= 1
 
 
 @pytest.mark.parametrize("size", [1, 6, 7])

@@ -10,7 +10,10 @@ import torch
 from data_synthetic import GaussianBall
 from torchdic import Fidelity, Grid, Volume
 from torchdic.errors import SlabWarning, UnstableError
+from torchdic.memory import batches
 from torchdic.plane_waves import axial_difference, to_field, to_spectrum
+from torchdic.propagation import split_step as split_module
+from torchdic.propagation.slab import Slab, cross_slab
 from torchdic.propagation.split_step import slab_mean, split_step
 
 N0 = 1.36
@@ -52,6 +55,51 @@ def test_weak_grating_scatters_as_first_born(source, harmonic_y, harmonic_x, ord
         found = complex(spectrum[sign * harmonic_y, sign * harmonic_x])
         # midpoint rule over 40 slabs, and the next Born order, of size k0·ε·T
         assert abs(found - expected) < 1e-3 * abs(born) + K0 * epsilon * thickness * 1e-3
+
+
+RINGS = momentum(
+    *((r * math.sin(a + t), r * math.cos(a + t)) for r, t in ((0.2, 0.0), (0.5, 0.1)) for a in range(4)), (0.5, 0.0)
+)
+
+
+def test_sources_of_a_ring_share_their_screens(smooth_field):
+    """Their spectra and gradients are those of each source alone."""
+    grid = Grid((3, 8, 9), (0.5, 0.22, 0.2))
+    counts = split_module._screens(RINGS, torch.tensor(N0))[1]
+    assert counts == [4, 5]
+    assert split_module._screens(RINGS[[0, 4, 1, 5]], torch.tensor(N0))[1] is None
+    factors = torch.randn(9, 8, 9, dtype=torch.complex128)
+    for order in (1, 2):
+        delta = (smooth_field(grid, 0.03) + 0.01).requires_grad_()
+        light = WAVELENGTH, RINGS, Fidelity(order=order)
+        together = split_step(Volume(grid, delta, N0), *light)
+        alone = torch.cat([split_step(Volume(grid, delta, N0), WAVELENGTH, p[None], light[2]) for p in RINGS])
+        torch.testing.assert_close(together, alone, rtol=1e-12, atol=1e-14)
+        one, other = (torch.autograd.grad((s * factors).real.sum(), delta)[0] for s in (together, alone))
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-12 * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("in_cache", [1, 1 << 20], ids=["source by source", "at once"])
+@pytest.mark.parametrize("screens", [None, [3], [1, 2]], ids=str)
+@pytest.mark.parametrize("absorbs", [False, True])
+@pytest.mark.parametrize("order", [1, 2])
+def test_derivative_of_a_slab_is_the_central_difference(monkeypatch, order, absorbs, screens, in_cache):
+    """In each of its variables, whatever the parts in which sources are taken."""
+    monkeypatch.setattr(batches, "IN_CACHE", in_cache)
+    B = torch.rand(4, 3, dtype=torch.complex128 if absorbs else torch.float64)
+    pz0 = 1 + torch.rand(len(screens or [1] * 3), 1, 1, dtype=torch.float64)
+    variables = [B, pz0, *(torch.randn(3, 4, 3, dtype=torch.complex128) for _ in range(3))]
+    for variable in variables:
+        variable.requires_grad_()
+    assert torch.autograd.gradcheck(lambda *v: cross_slab(Slab(order, 1.3, screens), *v), variables)
+
+
+def test_second_derivative_of_a_wave_is_refused():
+    """It isn't left out in silence."""
+    delta = torch.full((2, 4, 4), 0.01, dtype=torch.float64, requires_grad=True)
+    spectrum = split_step(Volume(Grid((2, 4, 4), (0.5, 0.3, 0.3)), delta, N0), WAVELENGTH, momentum(), Fidelity())
+    with pytest.raises(RuntimeError, match="create_graph"):
+        torch.autograd.grad(spectrum.abs().sum(), delta, create_graph=True)
 
 
 def ball_volume(slices=24, contrast=0.05, dtype=torch.float64, n=36):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchdic.fidelity import Defocus
 from torchdic.grid import Grid
+from torchdic.imaging.coherent import coherent_images
 from torchdic.imaging.passband import Passband
 from torchdic.imaging.polarised import polarised_images, state_transfers
 from torchdic.imaging.pupil import Pupil, Waves
@@ -73,44 +74,50 @@ class Imaging:
         spectrum = pupil.through(spectrum)
         spread = Spread(waves, self.background if objective is None else objective.na, self.plane)
         check_wrap_around(spectrum, spread, weights, acquisition, cut=self.band_limit)
-        focused = self._focused(spectrum, pupil.difference, spread)
-        if microscope.lenses is None:
-            frequencies = frequencies if microscope.condenser_prism else waves.field_frequencies()
-            images = self._scalar_images(focused, frequencies, weights, shape)
-        else:
+        defocus = self._defocus(pupil.difference, spread)
+        if microscope.lenses is not None:
             transfers = state_transfers(waves, pupil.passes, microscope, acquisition, components)
-            images = polarised_images(focused, transfers, weights, shape)
+            images = polarised_images((spectrum * E[:, None] for E in defocus), transfers, weights, shape)
+        else:
+            seen_by_prism = frequencies if microscope.condenser_prism else waves.field_frequencies()
+            images = self._scalar_images(spectrum.squeeze(1), defocus, seen_by_prism, weights, shape)
         return torch.stack(images).unflatten(0, (len(acquisition.focus), len(acquisition.prisms))).transpose(0, 1)
 
-    def _focused(self, spectrum: Tensor, difference: Tensor, spread: Spread) -> Iterator[Tensor]:
-        """The spectrum (source, component, y, x) at one focus after the other."""
+    def _defocus(self, difference: Tensor, spread: Spread) -> Iterator[Tensor]:
+        """The factor (source, y, x) of each wave on its way to one focus after the other."""
         k0 = 2 * math.pi / self.microscope.wavelength
-        difference = difference[:, None]
         for focus in self.acquisition.focus:
             # a number stays a number: to bring a tensor to another device would make the program wait for it
             depth = focus.to(difference) if isinstance(focus, Tensor) else focus
-            wave = spectrum * exp_i(k0 * (depth - self.plane) * difference)
-            yield spread.cut(wave, focus) if self.band_limit else wave
+            factor = exp_i(k0 * (depth - self.plane) * difference)
+            yield spread.cut(factor, focus) if self.band_limit else factor
 
     def _scalar_images(
-        self, focused: Iterable[Tensor], frequencies: Tensor, weights: Tensor, shape: tuple[int, int]
+        self, spectrum: Tensor, defocus: Iterable[Tensor], frequencies: Tensor, weights: Tensor, shape: tuple[int, int]
     ) -> list[Tensor]:
         """The images of each focus and prism where lenses leave polarisation alone: the two beams are scalar fields.
 
-        focused: the spectrum at each focus, of one component. frequencies: at which the prism acts. shape: of the
-        images (y, x).
+        spectrum: (source, y, x). frequencies: at which the prism acts. shape: of the images (y, x).
         """
-        polarisers = self.microscope.polarisers
-        transfers = [None if prism is None else prism.transfer(frequencies) for prism in self.acquisition.prisms]
+        polarisers, prisms = self.microscope.polarisers, self.acquisition.prisms
+        transfers = [
+            torch.ones_like(frequencies[..., 0, :, :]) if prism is None else prism.transfer(frequencies)
+            for prism in prisms
+        ]
+        transfers = [transfer if transfer.ndim == 3 else transfer[None] for transfer in transfers]
+        transfers = [transfer.to(spectrum.dtype) for transfer in transfers]
+        if polarisers is None:
+            return [
+                image for factor in defocus for image in coherent_images(spectrum, factor, transfers, weights, shape)
+            ]
         images = []
-        for component in focused:
-            wave = component.squeeze(1)
-            for prism, transfer in zip(self.acquisition.prisms, transfers, strict=True):
-                field = to_field(wave if transfer is None else wave * transfer, shape)
-                if prism is None or polarisers is None:
-                    # the sum over sources comes first: a sum over two neighbours in memory is slow
+        for factor in defocus:
+            wave = spectrum * factor
+            for prism, transfer in zip(prisms, transfers, strict=True):
+                field = to_field(wave * transfer, shape)
+                if prism is None:
                     images.append(torch.tensordot(weights, torch.view_as_real(field).square(), 1).sum(-1))
-                else:
-                    stopped = to_field(wave * prism.parallel(frequencies), shape)
-                    images.append(torch.einsum("syx,s->yx", polarisers.intensity(field, stopped, prism.bias), weights))
+                    continue
+                stopped = to_field(wave * prism.parallel(frequencies), shape)
+                images.append(torch.einsum("syx,s->yx", polarisers.intensity(field, stopped, prism.bias), weights))
         return images

@@ -78,14 +78,12 @@ class Spread:
         """Which waves are the sources' own, f = 0: they fill all of space, so they leave no array."""
         return (self.waves.frequencies == 0).all(-3)
 
-    def cut(
-        self, spectrum: Complex[Tensor, "source component y x"], focus: float | Tensor
-    ) -> Complex[Tensor, "source component y x"]:
-        """The spectrum at a focus without the waves that have left the array."""
+    def cut(self, factor: Complex[Tensor, "source y x"], focus: float | Tensor) -> Complex[Tensor, "source y x"]:
+        """The factor of the waves at a focus, 0 for the waves that have left the array."""
         beyond = self.beyond(self.distance(focus))
         if beyond is None:
-            return spectrum
-        return torch.where(((beyond > 0) & ~self.direct)[:, None], 0, spectrum)
+            return factor
+        return torch.where((beyond > 0) & ~self.direct, 0, factor)
 
 
 @torch.no_grad()

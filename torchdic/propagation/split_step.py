@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
@@ -14,7 +13,8 @@ from torchdic.errors import SlabWarning, UnstableError
 from torchdic.fidelity import Fidelity
 from torchdic.memory.batches import replay
 from torchdic.memory.batches import slabs as ranges
-from torchdic.plane_waves import axial_difference, axial_momentum, exp_i, to_field, to_spectrum
+from torchdic.plane_waves import axial_difference, axial_momentum, exp_i
+from torchdic.propagation.slab import Screens, Slab, cross_slab
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
@@ -31,30 +31,8 @@ MOST_ENERGY = 1.1
 # to waves that they cut.
 LEAST_ENERGY = 0.9
 
-
-def _root(square: Tensor) -> Tensor:
-    """The root of real numbers, or of complex numbers that aren't 0."""
-    return _ComplexRoot.apply(square) if square.is_complex() else square.sqrt()  # pyright: ignore[reportReturnType]
-
-
-class _ComplexRoot(torch.autograd.Function):
-    """The root of complex numbers, six times as fast as torch.sqrt on the CPU."""
-
-    @staticmethod
-    def forward(ctx: Any, square: Tensor) -> Tensor:
-        # the larger part first, so that nothing cancels
-        larger = ((square.abs() + square.real.abs()) / 2).sqrt()
-        smaller = square.imag.abs() / (2 * larger)
-        forward = square.real >= 0
-        imaginary = torch.where(forward, smaller, larger)
-        result = torch.complex(torch.where(forward, larger, smaller), imaginary.copysign(square.imag))
-        ctx.save_for_backward(result)
-        return result
-
-    @staticmethod
-    def backward(ctx: Any, result_bar: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (result,) = ctx.saved_tensors
-        return result_bar / (2 * result.conj())
+# Screens are shared where there are at most so many for each source. Otherwise few sources would be computed at a time.
+MOST_SCREENS = 0.5
 
 
 def split_step(
@@ -76,7 +54,7 @@ def split_step(
     The textbook's phase screen k0·Δn·dz is wrong for oblique light, because the effect of Δn depends on the angle after
     scattering as well as before. With B = n² − n0² the one-way kernel is B/(p_z(f) + p_z(f')). Here the screen is φ =
     k0 dz B/(√(n² − |p0|²) + p_z0), which is exact for a slab along the source. What it scatters is multiplied by G² =
-    p_z0/p_z(f + f_s), to first or second order in φ.
+    p_z0/p_z(f + f_s), to first or second order in φ: see `torchdic.propagation.slab`.
 
     Raises UnstableError if the slabs are so thick that this makes energy, or if the index falls below a source's |p0|.
     Warns with SlabWarning if the slabs lose energy although nothing absorbs.
@@ -84,48 +62,53 @@ def split_step(
     steps = fidelity.steps or volume.grid.shape[0]
     dz = volume.grid.extent[0] / steps
     k0, n0 = 2 * math.pi / wavelength, volume.background
-    pz0 = axial_momentum(n0, momentum)[:, None, None]
     slices = [*volume.delta.unbind(0), *(() if volume.absorption is None else volume.absorption.unbind(0))]
     count = len(volume.delta)
 
     difference, pz = axial_difference(volume.grid, wavelength, n0, momentum)
     H = torch.where(pz > 0, exp_i(k0 * dz / 2 * difference), 0)
-    # −1 removes what a screen scatters into evanescent waves, before the next half of the screen can scatter it back
-    excess = torch.where(pz > 0, pz0 / pz.clamp_min(LOWEST_PZ) - 1, -1)
-
-    advance = _first_order if fidelity.order == 1 else _second_order
+    pz0 = axial_momentum(n0, momentum)[:, None, None]
+    # 0 removes what a screen scatters into evanescent waves, before the next half of the screen can scatter it back
+    squared_gain = torch.where(pz > 0, pz0 / pz.clamp_min(LOWEST_PZ), 0)
+    g = (squared_gain if fidelity.order == 1 else squared_gain - 1).to(H.dtype)
+    square, screens = _screens(momentum, n0)
+    pz0 = (n0**2 - square).sqrt()[:, None, None]
+    slab = Slab(fidelity.order, k0 * dz, screens)
 
     def cross(
-        first: int, last: int, S: Tensor, H: Tensor, excess: Tensor, pz0: Tensor, n0: Tensor, *slices: Tensor
+        first: int, last: int, V: Tensor, H: Tensor, g: Tensor, pz0: Tensor, n0: Tensor, *slices: Tensor
     ) -> Tensor:
+        HH = H * H
         for step in range(first, last):
             n = n0 + slab_mean(slices[:count], step, steps)
-            path = (n - n0) * (n + n0)
+            B = (n - n0) * (n + n0)
             if len(slices) > count:
                 kappa = slab_mean(slices[count:], step, steps)
-                path = torch.complex(path - kappa**2, 2 * n * kappa)
-            S = advance(k0 * dz * path / (_root(pz0.square() + path) + pz0), S, H, excess)
-        return S
+                B = torch.complex(B - kappa**2, 2 * n * kappa)
+            V = cross_slab(slab, B, pz0, V, H if step == steps - 1 else HH, g)
+        return V
 
     S = torch.zeros_like(H)
     S[:, 0, 0] = 1
     for first, last in ranges(steps, split=slabs):
-        S = replay(partial(cross, first, last), S, H, excess, pz0, n0, *slices, when=slabs)
+        S = replay(partial(cross, first, last), S, H, g, pz0, n0, *slices, when=slabs)
     _check_energy(S.detach(), pz, volume, momentum, steps)
     return S
 
 
-def _first_order(phi: Tensor, S: Tensor, H: Tensor, excess: Tensor) -> Tensor:
-    V = S * H
-    scattered = to_spectrum((exp_i(phi) - 1) * to_field(V))
-    return H * (V + (1 + excess) * scattered)
+def _screens(momentum: Tensor, n0: Tensor) -> tuple[Tensor, Screens]:
+    """|p0|² of each screen, (screen,), and how many consecutive sources share it.
 
-
-def _second_order(phi: Tensor, S: Tensor, H: Tensor, excess: Tensor) -> Tensor:
-    e = exp_i(phi / 2)
-    u = e * to_field(S * H)
-    a = to_field(excess * to_spectrum(1j * phi * u))
-    return H * to_spectrum(e * (u + a))
+    A screen depends on a source's |p0| alone, which is the same all along a ring of the condenser, but for rounding.
+    """
+    square = momentum.square().sum(-1)
+    if momentum.requires_grad or square.device.type != "cpu":  # to find rings elsewhere would make the program wait
+        return square, None
+    rounding = 16 * torch.finfo(square.dtype).eps * number(n0) ** 2
+    _, counts = (square / rounding).round().unique_consecutive(return_counts=True)
+    if len(counts) > len(square) * MOST_SCREENS:
+        return square, None
+    return square[counts.cumsum(0) - 1], counts.tolist()
 
 
 @torch.no_grad()
