@@ -24,7 +24,7 @@ from torchdic.plane_waves import to_field
 def coherent_images(
     spectrum: Complex[Tensor, "source v u"],
     defocus: Complex[Tensor, "source v u"],
-    transfers: Sequence[Complex[Tensor, "_ v u"]],
+    transfers: Sequence[Float[Tensor, "_ v u"]],
     weights: Float[Tensor, " source"],
     shape: tuple[int, int],
 ) -> Float[Tensor, "prism row column"]:
@@ -32,7 +32,7 @@ def coherent_images(
 
     spectrum: S, behind the pupil.
     defocus: E, to this focus.
-    transfers: D of each prism, real numbers.
+    transfers: D of each prism.
     weights: w of each source.
     shape: of the images (y, x), along no axis smaller than the spectrum.
     """
@@ -43,11 +43,13 @@ class _Coherent(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, S: Tensor, E: Tensor, weights: Tensor, shape: tuple[int, int], *transfers: Tensor) -> Tensor:
         ctx.save_for_backward(S, E, weights, *transfers)
-        images = S.real.new_zeros(len(transfers), *shape, 2)
+        images = S.real.new_zeros(len(transfers), *shape)
         for part, fields in _fields(S, E, transfers, shape):
             for image, field in zip(images, fields, strict=True):
-                image += torch.tensordot(weights[part], torch.view_as_real(field).square_(), 1)
-        return images[..., 0] + images[..., 1]
+                squares = torch.tensordot(weights[part], torch.view_as_real(field).square_(), 1)
+                image += squares[..., 0]
+                image += squares[..., 1]
+        return images
 
     @staticmethod
     @once
@@ -67,10 +69,10 @@ class _Coherent(torch.autograd.Function):
                     weights_bar[part] += (U.square() * bar).sum((1, 2, 3)) / 2
                 U *= bar
                 C = torch.fft.fft2(field)[:, :v, :u]
-                T += _some(D, part) * C
+                T += _some(D, part).to(C.dtype) * C
                 if D_bar is not None:
                     own = (E[part] * S[part]).conj() * (w * C)
-                    _some(D_bar, part).add_(own.sum_to_size(_some(D, part).shape))
+                    _some(D_bar, part).add_(own.real.sum_to_size(_some(D, part).shape))
             T *= w
             if S_bar is not None:
                 S_bar[part] = E[part].conj() * T
@@ -92,7 +94,7 @@ def _fields(
 def _field(padded: Tensor, wave: Tensor, D: Tensor) -> Tensor:
     """U of one prism. padded: an array of U's shape, whose first waves are overwritten, and the others 0."""
     _, v, u = wave.shape
-    torch.mul(D, wave, out=padded[:, :v, :u])
+    torch.mul(D.to(wave.dtype), wave, out=padded[:, :v, :u])
     return to_field(padded)
 
 

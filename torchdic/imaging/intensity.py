@@ -105,7 +105,6 @@ class Imaging:
             for prism in prisms
         ]
         transfers = [transfer if transfer.ndim == 3 else transfer[None] for transfer in transfers]
-        transfers = [transfer.to(spectrum.dtype) for transfer in transfers]
         if polarisers is None:
             return [
                 image for factor in defocus for image in coherent_images(spectrum, factor, transfers, weights, shape)

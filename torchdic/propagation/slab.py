@@ -89,7 +89,7 @@ class _FirstOrder(torch.autograd.Function):
         for (part, its), f in zip(_parts(H, ctx.slab.screens), kept, strict=True):
             Y = H[part] * bar[part]
             A = to_spectrum(g[part] * Y)
-            _add(summed[its], f * A)
+            _add(summed, its, f * A)
             torch.add(to_field(A.mul_(weak[its])), Y, out=V_bar[part])
             if H_bar is not None or g_bar is not None:
                 X = to_spectrum(weak[its] * f)
@@ -128,7 +128,7 @@ class _SecondOrder(torch.autograd.Function):
             q = to_field(r)
             t = to_spectrum(g[part] * q)
             u_bar = (i_phi[its] * t).add_(r)
-            _add(summed[its], (r * both).add_(t.mul_(2).add_(u_bar).mul_(u)))
+            _add(summed, its, (r * both).add_(t.mul_(2).add_(u_bar).mul_(u)))
             V_bar[part] = to_field(u_bar.mul_(e[its]))
             if g_bar is not None:
                 g_bar[part] = to_spectrum(i_phi[its] * u) * q
@@ -164,18 +164,24 @@ def _root(square: Tensor) -> Tensor:
     return torch.complex(torch.where(forward, larger, smaller), imaginary.copysign(square.imag))
 
 
-def _parts(V: Tensor, screens: Screens) -> Iterator[tuple[slice, slice]]:
+def _parts(V: Tensor, screens: Screens) -> Iterator[tuple[slice, slice | Tensor]]:
     """The sources in parts, and the screens of each part: a single one, or one for each source."""
+    parts = in_cache(V)
     if screens is None:
-        yield from ((part, part) for part in in_cache(V))
-        return
-    first = 0
-    for screen, count in enumerate(screens):
-        for part in in_cache(V[first : first + count]):
-            yield slice(first + part.start, first + part.stop), slice(screen, screen + 1)
-        first += count
+        yield from ((part, part) for part in parts)
+    elif len(parts) == 1:  # few pixels: a call for each screen would take longer than copies of the screens
+        yield parts[0], torch.arange(len(screens)).repeat_interleave(torch.tensor(screens))
+    else:
+        first = 0
+        for screen, count in enumerate(screens):
+            for part in in_cache(V[first : first + count]):
+                yield slice(first + part.start, first + part.stop), slice(screen, screen + 1)
+            first += count
 
 
-def _add(summed: Tensor, values: Tensor) -> None:
+def _add(summed: Tensor, its: slice | Tensor, values: Tensor) -> None:
     """Add the sources' values to those of their screens."""
-    summed += values if len(summed) == len(values) else values.sum(0)
+    if isinstance(its, Tensor):
+        summed.index_add_(0, its, values)
+    else:
+        summed[its] += values if len(summed[its]) == len(values) else values.sum(0)
