@@ -10,9 +10,9 @@ from absolute import Absolute
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.descent import descend, minimise
-from recon.fit.prior import total_variation
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
+from recon.prior.edges import total_variation
 from recon.report.metrics import mean_inside, residual_rms, volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError

@@ -6,10 +6,11 @@ import torch
 from absolute import Absolute
 
 from recon.fit.bounds import SHARPNESS, Bounds
-from recon.fit.prior import SMOOTHING, Magnitude, TotalVariation, magnitude, total_variation
-from recon.fit.schedule import cosine, held_then_annealed
 from recon.misfit.base import spatial_variance
 from recon.misfit.gaussian import GaussianMisfit
+from recon.prior.edges import SMOOTHING, TotalVariation, total_variation
+from recon.prior.magnitude import Magnitude, magnitude
+from recon.prior.schedule import cosine, held_then_annealed
 from torchdic import Grid, Volume
 
 BOUNDS = {

@@ -6,7 +6,7 @@ import math
 import torch
 
 from data_synthetic import Bead
-from recon.fit.descent import Recipe
+from recon.fit.problem import Recipe
 from recon.report import figures
 from recon.report.comparison import Truth, compare, table
 from recon.run.exact_images import exact_images

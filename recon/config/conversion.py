@@ -16,7 +16,7 @@ from cattrs.errors import IterableValidationError, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
-from recon.config.schema import CompensatorSection, Config, DataSection, WedgeSection
+from recon.config.schema import CompensatorSection, Config, DataSection, ReconstructionSection, WedgeSection
 from torchdic import Acquisition, Candidate, Condenser, JonesPupil, Layer, Objective, Polarisation, Prism, Spectrum
 
 # The name by which a list of prisms holds bright field, which has none.
@@ -105,6 +105,23 @@ def _optional(value: Any, kind: Any) -> Any:
 
 def _scale(value: Any, _: Any) -> float | str:
     return value if value == "background" else _number(value, float)
+
+
+def _weights(value: Any, _: Any) -> Any:
+    if value == "auto":
+        return value
+    try:
+        return _pair(value, None)
+    except ValueError as error:
+        raise ValueError(f"{value!r} must be 'auto', or an array of the first and the last weight") from error
+
+
+def _optional_number_or_auto(value: Any, _: Any) -> Any:
+    return value if value == "auto" else _optional(value, int | None)
+
+
+def _number_or_auto(value: Any, _: Any) -> Any:
+    return value if value == "auto" else _whole_number(value, int)
 
 
 # --- from TOML: arrays ------------------------------------------------------------------------------------------------
@@ -226,6 +243,12 @@ FIELDS: dict[type, dict[str, Hook]] = {
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _array_of(_number)),
     Acquisition: {"prisms": _array_of(_prism), "focus": _array_of(_number)},
     DataSection: {"scale": _scale},
+    ReconstructionSection: {
+        "tv": _weights,
+        "learn": _array_of(_string),
+        "draft_sources": _optional_number_or_auto,
+        "margin": _number_or_auto,
+    },
     Config: {"candidates": _array_of(_candidate)},
 }
 

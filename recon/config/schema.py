@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from recon.fit.descent import Recipe
+from recon.fit.problem import Recipe
 from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope, Prism
 from torchdic.instrument.microscope import check_apertures
 
@@ -94,7 +94,10 @@ class DataSection:
         integer stacks, and takes floats as relative to the empty bright field.
     offset: counts that the camera gives in the dark.
     order: of the polynomial in (y, x) that is fitted to a background.
-    Raises ValueError for a scale not above 0, an offset that isn't finite and an order below 0.
+    gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
+        None is one noise for each prism, as it was measured.
+    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite and an order
+    below 0.
     """
 
     path: str
@@ -102,8 +105,14 @@ class DataSection:
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
     order: int = 2
+    gain: float | None = None
+    read_noise: float = 0.0
 
     def __post_init__(self) -> None:
+        if self.gain is not None and not (0 < self.gain < math.inf):
+            raise ValueError(f"gain {self.gain} must be above 0")
+        if not (0 <= self.read_noise < math.inf):
+            raise ValueError(f"read_noise {self.read_noise} must be at least 0")
         if not isinstance(self.scale, str | None) and not (0 < self.scale < math.inf):
             raise ValueError(f"scale {self.scale} must be above 0")
         if not math.isfinite(self.offset):
@@ -117,13 +126,18 @@ class ReconstructionSection(Recipe):
     """How to fit the volume, see `recon.descend.Recipe`, and how often to save a checkpoint.
 
     checkpoint_every: steps between two checkpoints.
+    margin: voxels of specimen beyond the field of the images on each side, which the light from there asks for; "auto"
+        adds them where the images show the specimen at their border.
     Raises ValueError where a value breaks its law.
     """
 
     checkpoint_every: int = 10
+    margin: int | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.margin, int) and self.margin < 0:
+            raise ValueError(f"margin {self.margin} must be at least 0")
         if self.checkpoint_every < 1:
             raise ValueError(f"checkpoint_every {self.checkpoint_every} must be at least 1 step")
 

@@ -1,48 +1,22 @@
-"""Adam's descent from a start to the volume that explains the data, as a generator of steps."""
+"""A descent to the volume that explains the data, by the method that the problem names, as a generator of steps."""
 
-import math
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.fit.planned import PlanRecord
+from recon.fit.adam import minimise_by_adam
+from recon.fit.newton.descent import minimise_by_newton
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
-from recon.fit.unknowns import IndexDifference, State, Unknowns
+from recon.fit.step import Step
 from torchdic import Acquisition, Fidelity, Grid, Microscope
-from torchdic.errors import UnstableError
 
-# A step's row of the log: number, misfit, loss, seconds.
-Row = tuple[int, float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One step of a descent, and all that is needed to go on from it. Its tensors are not changed afterwards.
-
-    number: steps taken so far. misfit, loss: of the volume before this step. delta: Δn (z, y, x) after it.
-    seconds: that the descent has taken, its start included. values: what every unknown stands for after the step, by
-    name. state: parameters and Adam's moments, by the unknown's name. plans: all that were made for a tolerance so far;
-    the last is that of the current fidelity.
-    """
-
-    number: int
-    misfit: float
-    loss: float
-    delta: Float[Tensor, "z y x"]
-    seconds: float
-    values: dict[str, Tensor]
-    state: State
-    plans: tuple[PlanRecord, ...] = ()
-
-    @property
-    def row(self) -> Row:
-        """The step's row of the log."""
-        return self.number, self.misfit, self.loss, self.seconds
+# The descents by their names.
+DESCENTS: dict[str, Callable[[Problem, Step | None], Iterator[Step]]] = {
+    "newton": minimise_by_newton,
+    "adam": minimise_by_adam,
+}
 
 
 def descend(
@@ -69,54 +43,10 @@ def descend(
 
 
 def minimise(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
-    """Lower the misfit and the priors of a problem by Adam; yields every step.
+    """Lower the misfit and the priors of a problem by its method; yields every step.
 
     resume: the step to go on from; the rest is as if there had been no interruption.
-    Raises ValueError where the step has other unknowns, or FloatingPointError where the fit diverges.
+    Raises ValueError where the step has other unknowns or is another method's, and FloatingPointError where the fit
+    diverges.
     """
-    started = time.perf_counter()
-    if resume is None:
-        unknowns = Unknowns.at_start(problem.unknowns, problem.setup, problem.misfit)
-        adam, first, seconds, plans = unknowns.adam(), 0, 0.0, ()
-    else:
-        unknowns = Unknowns.restored(problem.unknowns, resume.state, problem.misfit.data.device)
-        adam, first, seconds, plans = unknowns.adam(resume.state), resume.number, resume.seconds, resume.plans
-
-    for step in range(first, problem.steps):
-        unknowns.set_rates(adam, step, problem.steps)
-        misfit, loss, plans = _move(problem, unknowns, adam, step, plans)
-        values = unknowns.values()
-        delta = values.get(IndexDifference.name, problem.setup.volume.delta)
-        _check_convergence(step + 1, loss, values, float(problem.setup.volume.background) + float(delta.min()))
-        taken = seconds + time.perf_counter() - started
-        yield Step(step + 1, misfit, loss, delta, taken, values, unknowns.state(adam), plans)
-
-
-def _move(
-    problem: Problem, unknowns: Unknowns, adam: torch.optim.Adam, step: int, plans: tuple[PlanRecord, ...]
-) -> tuple[float, float, tuple[PlanRecord, ...]]:
-    """Take one step of Adam; returns the misfit and the loss before it, and the plans so far."""
-    setup = unknowns.into(problem.setup)
-    fidelity, plans = problem.fidelity.at(step, problem.steps, setup, plans)
-    try:
-        images = setup.images(fidelity)
-    except UnstableError as error:
-        raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
-    misfit = problem.misfit(images)
-    loss = misfit
-    for prior in problem.priors:
-        weight = prior.weight(step, problem.steps)
-        if weight > 0:
-            loss = loss + weight * prior(setup.volume)
-    adam.zero_grad()
-    loss.backward()
-    adam.step()
-    return float(misfit.detach()), float(loss.detach()), plans
-
-
-def _check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:
-    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive."""
-    if not math.isfinite(loss) or not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}")
-    if lowest <= 0:
-        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}")
+    yield from DESCENTS[problem.method](problem, resume)

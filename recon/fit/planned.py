@@ -52,10 +52,12 @@ class GivenFidelity:
 class PlannedFidelity:
     """A fidelity that is planned for a tolerance, and again each time the volume's strength has doubled.
 
-    tolerance: rms error of the images over their standard deviation, see `torchdic.plan`.
+    tolerance: rms error of the images over their standard deviation, see `torchdic.plan`. draft_sources: condenser
+    directions of Newton's steps, where the plan asks for more; Adam's have all.
     """
 
     tolerance: float
+    draft_sources: int | None = None
 
     def at(
         self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]

@@ -8,45 +8,108 @@ from typing import Literal
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
+from recon.fit.nuisances.named import NUISANCES
 from recon.fit.planned import GivenFidelity, PlannedFidelity
-from recon.fit.prior import Magnitude, Prior, TotalVariation
 from recon.fit.setup import Setup
 from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
+from recon.prior.base import Prior
+from recon.prior.edges import Edges, LogTotalVariation, Smoothness, TotalVariation
+from recon.prior.magnitude import Magnitude
+from recon.prior.weight import FollowsNoise
+from recon.recording.background import noise_level
 from torchdic import Fidelity
+
+# Steps at most, and condenser directions of draft images, of each descent.
+STEPS = {"newton": 20, "adam": 150}
+DRAFT_SOURCES = {"newton": 32, "adam": 24}
+
+# The priors of edges by their names.
+PRIORS: dict[str, type[Edges]] = {"log-tv": LogTotalVariation, "tv": TotalVariation, "smooth": Smoothness}
+
+# Weight of the mean |Δn|: relative to that of the edges, where it follows the noise, and by itself.
+SPARSE, ALONE = 0.25, 0.5
 
 
 @dataclass(frozen=True)
 class Recipe:
     """How to descend. The defaults suit specimens with edges: beads and cells.
 
-    steps: of Adam. learning_rate: its first one, in Δn; it falls to 0 along half a cosine. tv: first and last weight of
-    the total variation. l1: weight of the mean |Δn|. bounds: of Δn. start: "linear" or "zero". draft_sources: condenser
-    directions for the first 60 % of the steps, where the fidelity asks for more; None is all of them at once.
+    method: "newton", the proximal Newton descent; "adam"; or, without a descent, "linear" and "opl" (`recon.earlier`).
+    steps: at most; None is 20 of Newton's, which end by themselves, and 150 of Adam's.
+    learning_rate: Adam's first one, in Δn; it falls to 0 along half a cosine.
+    tv: weight of the prior of edges: "auto" follows the noise; or the first and the last.
+    l1: weight of the mean |Δn|; None is a quarter of tv where that follows the noise, and 0.5 where it is given.
+    prior: of edges: "log-tv" (few, however high), "tv" (few), "smooth" (none).
+    misfit: "gaussian", "poisson" or "robust".
+    learn: what is fitted beside Δn: "bias", "drift", "focus", "shear"; "brightness" of each image always is.
+    bounds: of Δn. start: of Adam, "linear" or "zero"; Newton's is empty.
+    draft_sources: condenser directions of Adam's first 60 % of the steps, and of all of Newton's, where the fidelity
+    asks for more; "auto" is 24 and 32, None is all of them at once.
     Raises ValueError where a value breaks its law.
     """
 
-    steps: int = 150
+    method: Literal["newton", "adam", "linear", "opl"] = "newton"
+    steps: int | None = None
     learning_rate: float = 5e-3
-    tv: tuple[float, float] = (60.0, 5.0)
-    l1: float = 0.5
+    tv: Literal["auto"] | tuple[float, float] = "auto"
+    l1: float | None = None
+    prior: Literal["log-tv", "tv", "smooth"] = "log-tv"
+    misfit: Literal["gaussian", "poisson", "robust"] = "gaussian"
+    learn: tuple[str, ...] = ()
     bounds: Bounds = field(default_factory=Bounds)
     start: Literal["linear", "zero"] = "linear"
-    draft_sources: int | None = 24
+    draft_sources: int | Literal["auto"] | None = "auto"
 
     def __post_init__(self) -> None:
-        if self.steps < 1:
+        if self.method not in (*STEPS, "linear", "opl"):
+            raise ValueError(f"method {self.method!r} must be 'newton', 'adam', 'linear' or 'opl'")
+        if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps} must be at least 1")
         if not (0 < self.learning_rate < math.inf):
             raise ValueError(f"learning_rate {self.learning_rate} must be above 0")
-        for name, value in (("tv", self.tv[0]), ("tv", self.tv[1]), ("l1", self.l1)):
-            if not (0 <= value < math.inf):
+        weights = () if self.tv == "auto" else (("tv", self.tv[0]), ("tv", self.tv[1]))
+        for name, value in (*weights, ("l1", self.l1)):
+            if value is not None and not (0 <= value < math.inf):
                 raise ValueError(f"{name} {value} must be at least 0")
         if self.start not in ("linear", "zero"):
             raise ValueError(f"start {self.start!r} must be 'linear' or 'zero'")
-        if self.draft_sources is not None and self.draft_sources < 1:
+        if isinstance(self.draft_sources, int) and self.draft_sources < 1:
             raise ValueError(f"draft_sources {self.draft_sources} must be at least 1")
+        for name in self.learn:
+            if name not in NUISANCES:
+                raise ValueError(f"learn {name!r} must be one of {', '.join(map(repr, NUISANCES))}")
+        if len(set(self.learn)) < len(self.learn):
+            raise ValueError(f"learn {list(self.learn)} names one twice")
+
+    @property
+    def descent(self) -> str:
+        """The descent whose constants count: the method, or Newton's where there is no descent."""
+        return self.method if self.method in STEPS else "newton"
+
+    @property
+    def most_steps(self) -> int:
+        """The number of steps at most."""
+        return self.steps or STEPS[self.descent]
+
+    @property
+    def drafts(self) -> int | None:
+        """Condenser directions of draft images; None is all."""
+        return DRAFT_SOURCES[self.descent] if self.draft_sources == "auto" else self.draft_sources
+
+    def priors(self) -> list[Prior]:
+        """The priors, with weights relative to the common one where that follows the noise."""
+        follows = self.tv == "auto"
+        first, last = (1.0, 1.0) if self.tv == "auto" else self.tv
+        sparse = self.l1 if self.l1 is not None else SPARSE if follows else ALONE
+        return [PRIORS[self.prior](first, last), Magnitude(sparse)]
+
+    def unknowns(self) -> list[Unknown]:
+        """Δn, and what is learned beside it. Brightness comes first, as it is always learned."""
+        names = ("brightness", *(name for name in self.learn if name != "brightness"))
+        index = IndexDifference(self.learning_rate, self.bounds, self.start)
+        return [index, *(NUISANCES[name]() for name in names)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +118,8 @@ class Problem:
 
     setup: the volume, microscope and acquisition as far as they are known; the unknowns replace parts of it.
     misfit: holds the measured images. unknowns: what is sought. priors: what is added to the misfit, in this order.
-    fidelity: of the images at each step. steps: how many there are.
+    fidelity: of the images at each step. steps: how many there are at most. method: of the descent, "newton" or "adam".
+    weight: a common factor of the priors that follows the noise; None is 1.
     Raises ValueError where the data's shape is not that of the setup's images, or two unknowns share a name.
     """
 
@@ -65,6 +129,8 @@ class Problem:
     priors: Sequence[Prior]
     fidelity: GivenFidelity | PlannedFidelity
     steps: int
+    method: str = "adam"
+    weight: FollowsNoise | None = None
 
     def __post_init__(self) -> None:
         expected, found = self.setup.shape, tuple(self.misfit.data.shape)
@@ -82,16 +148,29 @@ class Problem:
         fidelity: Fidelity | float,
         recipe: Recipe,
         misfit: Callable[[Tensor], Misfit] = GaussianMisfit,
+        noise: Sequence[float] | None = None,
     ) -> "Problem":
         """The problem of finding Δn as a recipe says.
 
         data: (prism, focus, y, x), relative to the empty bright field. fidelity: of the modelled images, or a tolerance
-        for which one is planned; the recipe's draft_sources is then not used. misfit: makes one from the data.
+        for which one is planned. misfit: makes one from the data. noise: standard deviation of the noise in each
+        prism's images, in the unit of the data; None is measured in them.
         """
-        unknowns = [IndexDifference(recipe.learning_rate, recipe.bounds, recipe.start)]
-        priors = [TotalVariation(*recipe.tv), Magnitude(recipe.l1)]
+        made = misfit(data)
         if isinstance(fidelity, Fidelity):
-            careful = GivenFidelity(fidelity, recipe.draft_sources)
+            careful = GivenFidelity(fidelity, recipe.drafts)
         else:
-            careful = PlannedFidelity(fidelity)
-        return cls(setup, misfit(data), unknowns, priors, careful, recipe.steps)
+            careful = PlannedFidelity(fidelity, recipe.drafts)
+        weight = None
+        if recipe.tv == "auto":
+            levels = measured_noise(data) if noise is None else list(noise)
+            weight = FollowsNoise(made.of_noise(levels))
+        unknowns, priors = recipe.unknowns(), recipe.priors()
+        return cls(setup, made, unknowns, priors, careful, recipe.most_steps, recipe.descent, weight)
+
+
+def measured_noise(data: Tensor) -> list[float] | None:
+    """Standard deviation of the noise in each prism's images; None where they are too small to tell."""
+    levels = [noise_level(images) for images in data.detach().cpu().numpy()]
+    known = [level for level in levels if level is not None]
+    return known if len(known) == len(levels) else None

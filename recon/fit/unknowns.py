@@ -15,10 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
-from recon.fit.schedule import cosine
 from recon.fit.setup import Setup
 from recon.fit.start import linear_start
 from recon.misfit.base import Misfit
+from recon.prior.schedule import cosine
 from torchdic import Volume
 
 # Distance in Δn from its bounds that every voxel starts with.

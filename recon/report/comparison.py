@@ -8,7 +8,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
-from recon.fit.descent import Recipe, Step, descend
+from recon.fit.descent import descend
+from recon.fit.problem import Recipe
+from recon.fit.step import Step
 from recon.report import figures
 from recon.report.metrics import mean_inside, volume_error
 from torchdic import Acquisition, Fidelity, Grid, Microscope

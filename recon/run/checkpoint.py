@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from recon.fit.descent import Row, Step
+from recon.fit.step import Row, Step
 from torchdic.files.whole import written_whole
 
 # Number of the format that is written and read. Checkpoints of before the second had none.

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from recon.fit.descent import Row
+from recon.fit.step import Row
 
 
 class Log:

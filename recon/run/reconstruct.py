@@ -10,23 +10,30 @@ from torch import Tensor
 
 from recon.config.conversion import flat
 from recon.config.schema import Config, ConfigError, SimulationSection
+from recon.earlier.direct import DIRECT, solved_directly
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.base import Misfit
-from recon.misfit.gaussian import GaussianMisfit
+from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError
 from recon.run.data import load_data
+from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, descend_recorded
 from recon.run.results import Result, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
 from torchdic.files.whole import written_whole
 
-# Without a [fidelity] section: the error of a first-order split step is below that of the condenser directions and of
-# the voxels.
-RECOMMENDED = Fidelity("wave", order=1)
+# Without a [fidelity] section. Newton's steps are computed with few directions and corrected to these images, whose
+# error is below the noise of 40 000 photons a pixel; each of Adam's many steps is computed with its own in full, and
+# the error of a first-order split step is below that of its directions and of the voxels.
+RECOMMENDED = Fidelity("wave", sources=128, padding=8)
+RECOMMENDED_FOR_ADAM = Fidelity("wave", order=1)
+
+# Pixels along a side of a field that is too small to tell whether the specimen goes on beyond it.
+LEAST_FIELD = 24
 
 
 def reconstruct(
@@ -36,27 +43,34 @@ def reconstruct(
     *,
     resume: bool = False,
     restart: bool = False,
-    misfit: Callable[[Tensor], Misfit] = GaussianMisfit,
+    misfit: Callable[[Tensor], Misfit] | None = None,
 ) -> Result:
     """Fit a volume to the configuration's stack and leave it in `out`, with metrics, log, configuration and figures.
 
     resume: go on from the checkpoint in `out`, if there is one. restart: begin anew although there is one.
-    misfit: makes the misfit that is lowered from the prepared stack (prism, focus, y, x).
+    misfit: makes the misfit that is lowered from the prepared stack (prism, focus, y, x); None is the configuration's.
     Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
     the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint saved.
     """
     if config.tolerance is None and config.fidelity is None:
-        config = replace(config, fidelity=RECOMMENDED)
+        adam = config.reconstruction.method == "adam"
+        config = replace(config, fidelity=RECOMMENDED_FOR_ADAM if adam else RECOMMENDED)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
     check_room_for_volume(config.volume.grid, device)
-    problem = _problem(config, data, misfit)
-    check_room_for_descent(problem, misfit)
+    made = misfit or misfit_for(config, measured)
+    problem = _problem(config, data, made, measured)
     identity = _identity(config, measured, problem.misfit)
     start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
     prepare_folder(out)
-    ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
-    result = write_results(out, config, measured, problem, ended)
+    if config.reconstruction.method in DIRECT:
+        step, sections = solved_directly(config.reconstruction, problem, _noise(measured))
+        ended = Checkpoint(step, [], identity)
+    else:
+        check_room_for_descent(problem, made)
+        ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
+        sections = None
+    result = write_results(out, config, measured, problem, ended, sections)
     (out / CHECKPOINT).unlink(missing_ok=True)
     return result
 
@@ -72,13 +86,34 @@ def prepare_folder(out: Path) -> None:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
 
 
-def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit]) -> Problem:
+def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], measured: Measured) -> Problem:
     """What the configuration asks to be fitted to the data, with the fidelity or for the tolerance that it gives."""
-    medium = empty_medium(config.volume.grid, config.volume.background, data)
-    setup = Setup(medium, config.microscope, config.acquisition)
+    margin = _margin(config, measured)
+    medium = empty_medium(config.volume.grid.widened(margin, margin), config.volume.background, data)
+    setup = Setup(medium, config.microscope, config.acquisition, margin=margin)
     fidelity = config.fidelity or config.tolerance
     assert fidelity is not None
-    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit)
+    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit, _noise(measured))
+
+
+def _margin(config: Config, measured: Measured) -> int:
+    """Voxels beyond the field on each side; a line says so where they are added without having been asked for."""
+    section = config.reconstruction
+    if section.margin != "auto":
+        return section.margin
+    if section.method in DIRECT or min(config.volume.shape[1:]) < LEAST_FIELD:
+        return 0
+    scene = config.volume.grid, config.microscope, config.volume.background
+    margin = needed_margin(measured.data, _noise(measured), *scene)
+    if margin > 0:
+        print(f"the images show the specimen at their border: {margin} voxels are added beyond it (margin = {margin})")
+    return margin
+
+
+def _noise(measured: Measured) -> list[float] | None:
+    """Standard deviation of each prism's noise; None where it isn't known of all."""
+    known = [report.noise for report in measured.prisms if report.noise is not None]
+    return known if len(known) == len(measured.prisms) else None
 
 
 def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:

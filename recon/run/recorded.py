@@ -4,9 +4,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from recon.fit.descent import Step, minimise
+from recon.fit.descent import minimise
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
+from recon.fit.step import Step
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint
 from recon.run.interruption import InterruptedRunError, signals_kept

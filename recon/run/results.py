@@ -1,7 +1,9 @@
 """What a finished reconstruction leaves in its folder: the volume, metrics, configuration and figures."""
 
+import math
 import warnings
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +13,15 @@ from torch import Tensor
 
 from recon.config.conversion import dump
 from recon.config.schema import Config
-from recon.fit.descent import Step
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
-from recon.fit.unknowns import with_values
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference, with_values
 from recon.recording.preparation import Measured, PrismReport
 from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.run.checkpoint import Checkpoint
-from torchdic.files.stack import write_volume
+from torchdic.files.stack import write_stack, write_volume
 from torchdic.files.whole import write_json, write_text
 
 
@@ -43,27 +45,50 @@ def model_images(problem: Problem, last: Step) -> Float[Tensor, "prism focus y x
 
 
 def metrics(
-    problem: Problem, last: Step, images: Float[Tensor, "prism focus y x"], reports: tuple[PrismReport, ...]
+    problem: Problem,
+    last: Step,
+    images: Float[Tensor, "prism focus y x"],
+    reports: tuple[PrismReport, ...],
+    method: str,
 ) -> dict[str, Any]:
     """The numbers of metrics.json.
 
     images: the model's, of the last step. reports: what the preparation found in each prism's measured images, such as
-    the standard deviation of their noise.
+    the standard deviation of their noise. method: that found the step.
     """
+    delta = within_field(problem, last.delta)
     noise = [report.noise for report in reports if report.noise is not None]
     found: dict[str, Any] = {
+        "method": method,
         "propagation": problem.fidelity.last(last.plans).propagation,
         "misfit": float(problem.misfit(images)),
         "noise_misfit": problem.misfit.of_noise(noise if len(noise) == len(reports) else None),
         "residual_rms": residual_rms(images, problem.misfit.data),
         "steps": last.number,
         "seconds": round(last.seconds, 3),
-        "delta": {"min": float(last.delta.min()), "max": float(last.delta.max()), "mean": float(last.delta.mean())},
+        "delta": {"min": float(delta.min()), "max": float(delta.max()), "mean": float(delta.mean())},
+        "learned": {name: value.tolist() for name, value in last.values.items() if name != IndexDifference.name},
         "prisms": [asdict(report) for report in reports],
     }
+    if last.weights:
+        found["tv"] = last.weights[-1]["tv"]
+        found["weights"] = [{k: _known(v) for k, v in record.items()} for record in last.weights]
+    if problem.setup.margin > 0:
+        found["margin"] = problem.setup.margin
     if last.plans:
         found["plans"] = list(last.plans)
     return found
+
+
+def within_field(problem: Problem, delta: Float[Tensor, "z row column"]) -> Float[Tensor, "z y x"]:
+    """Δn of the voxels behind the images, without the margin beyond them."""
+    margin = problem.setup.margin
+    return delta if margin == 0 else delta[:, margin:-margin, margin:-margin]
+
+
+def _known(value: Any) -> Any:
+    """A value as JSON can hold it: no number is null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def warn_of_poor_fit(misfit: float) -> None:
@@ -74,17 +99,28 @@ def warn_of_poor_fit(misfit: float) -> None:
     if misfit > 1:
         warnings.warn(
             f"the misfit {misfit:.3g} is above 1: empty medium would explain the stack better; "
-            "a smaller learning_rate or more tv may help",
+            "the optics in the configuration may not be those of the stack",
             PoorFitWarning,
             stacklevel=3,
         )
 
 
-def write_results(out: Path, config: Config, measured: Measured, problem: Problem, ended: Checkpoint) -> Result:
-    """Write a finished descent's volume, metrics, resolved configuration and figures into a folder."""
-    last, grid = ended.step, problem.setup.volume.grid
-    images, data, delta = model_images(problem, last), problem.misfit.data.cpu(), last.delta.cpu()
-    found = metrics(problem, last, images, measured.prisms)
+def write_results(
+    out: Path,
+    config: Config,
+    measured: Measured,
+    problem: Problem,
+    ended: Checkpoint,
+    sections: Float[Tensor, "focus y x"] | None = None,
+) -> Result:
+    """Write a finished descent's volume, metrics, resolved configuration and figures into a folder.
+
+    sections: optical path lengths in µm, where the method gives them.
+    """
+    last, grid = ended.step, problem.setup.field
+    images, data = model_images(problem, last), problem.misfit.data.cpu()
+    delta = within_field(problem, last.delta).cpu()
+    found = metrics(problem, last, images, measured.prisms, config.reconstruction.method)
     warn_of_poor_fit(found["misfit"])
     write_volume(out / "volume.ome.tif", delta, grid)
     comments = "".join(f"# {announce_record(record)}\n" for record in last.plans)
@@ -93,5 +129,9 @@ def write_results(out: Path, config: Config, measured: Measured, problem: Proble
     drawn = figures.draw_images(data, images.cpu(), config.acquisition.prisms, measured.focus, problem.setup.field)
     figures.save(drawn, out / "images.png")
     figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
-    figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
+    if ended.rows:
+        figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
+    if sections is not None:
+        steps = [abs(b - a) for a, b in pairwise(measured.focus)]
+        write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
     return Result(delta, found)

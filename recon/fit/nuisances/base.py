@@ -11,8 +11,8 @@ from recon.fit.unknowns import Unknown
 class Nuisance(Unknown):
     """A quantity of few numbers that the images depend on, but that isn't what is sought.
 
-    Adam moves it as any unknown, and `recon.fit.scalars.refined` by Gauss and Newton, with differences of images. A
-    subclass is a frozen dataclass with these fields, whose first value suits a well-aligned microscope:
+    Adam moves it as any unknown, and `recon.fit.nuisances.refinement.refined` by Gauss and Newton, with differences of
+    images. A subclass is a frozen dataclass with these fields, whose first value suits a well-aligned microscope:
     learning_rate: Adam's first, in the parameter's unit. step: of the differences, in the parameter's unit; ten of
     them are a large error. Raises ValueError unless both are above 0.
 

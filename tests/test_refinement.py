@@ -8,7 +8,7 @@ from absolute import Absolute
 from distant import Device, bring, send
 
 from data_synthetic import GaussianBall
-from recon.fit import scalars
+from recon.fit.nuisances import refinement
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.nuisances.bias import Bias, CommonBias
@@ -16,10 +16,10 @@ from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
 from recon.fit.nuisances.nearby import Nearby
+from recon.fit.nuisances.refinement import best_brightness, refined
 from recon.fit.nuisances.shear import ShearError
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
-from recon.fit.scalars import best_brightness, refined
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.unknowns import IndexDifference, with_values
 from recon.misfit.gaussian import GaussianMisfit
@@ -274,7 +274,7 @@ def test_a_step_that_would_raise_the_misfit_is_not_taken(monkeypatch):
     data = setup(brightness=BRIGHTNESS).images(FIDELITY)
     misfit, known, unknowns = GaussianMisfit(data), setup(), [Brightness()]
     start = starts(unknowns, known, misfit)
-    right = scalars._gauss_newton
+    right = refinement._gauss_newton
 
     def backwards(*arguments):
         step, length = right(*arguments)
@@ -311,7 +311,7 @@ def test_what_is_found_on_nearby_images_is_judged_by_new_ones(monkeypatch):
     """Where those are worse, nothing is taken; where half of the way is better, that is."""
     misfit, known, unknowns = GaussianMisfit(setup().images(FIDELITY)), setup(acquisition=turned(0.1)), [Bias()]
     start = starts(unknowns, known, misfit)
-    right = scalars._lowered
+    right = refinement._lowered
 
     def further(factor):
         def lowered(nearby, parameters, step, misfit):

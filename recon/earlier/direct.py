@@ -1,0 +1,40 @@
+"""The methods without a descent, as a descent of one step."""
+
+import math
+import time
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.earlier.path_length import path_length
+from recon.earlier.tikhonov import tikhonov
+from recon.fit.problem import Problem, Recipe
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference
+
+# The methods, by their names in a configuration.
+DIRECT = ("linear", "opl")
+
+
+def solved_directly(
+    recipe: Recipe, problem: Problem, noise: Sequence[float] | None
+) -> tuple[Step, Float[Tensor, "focus y x"] | None]:
+    """The volume by the recipe's method as the one step of a descent, and the sections of path length in µm, if any.
+
+    noise: standard deviation in each prism's images; None is unknown.
+    """
+    started, data = time.perf_counter(), problem.misfit.data
+    if recipe.method == "linear":
+        found = tikhonov(data, problem.setup, noise, recipe.bounds)
+        sections = None
+    else:
+        found = path_length(data, problem.setup, noise)
+        sections = found.opl
+    weight = found.weight if math.isfinite(found.weight) else None
+    record = {"step": 1, "tv": weight, "misfit": math.nan, "correlation": math.nan, "reason": found.rule}
+    seconds = time.perf_counter() - started
+    values = {u.name: u.value(u.start(problem.setup, problem.misfit)) for u in problem.unknowns[1:]}
+    values[IndexDifference.name] = found.delta
+    step = Step(1, math.nan, math.nan, found.delta, seconds, values, {}, (), (record,))
+    return step, sections

@@ -1,0 +1,74 @@
+"""What few condenser directions leave out, added to their images: the difference from careful images of a volume
+nearby.
+
+Images of few directions are cheap, but the difference between them and those of many is more than the noise of a bright
+stack, and a fit would make it a part of the specimen. It hardly changes with the volume. So it is computed now and
+then, without a gradient, and the steps are taken on few directions plus this difference: where they end, the volume
+explains the data by careful images (the defect correction of K. Böhmer, P. Hemker and H. Stetter, Computing Suppl. 5,
+1, 1984).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.setup import Setup
+from torchdic import Fidelity
+
+# A correction that changed the images by less than this share of the noise's misfit may serve REST further steps.
+SETTLED, REST = 0.004, 2
+
+# Directions of the first steps.
+COARSE = 18
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The difference of careful images from draft ones.
+
+    added: to the images that the microscope forms (prism, focus, row, column); None is nothing yet.
+    rest: accepted steps for which it still serves.
+    """
+
+    added: Float[Tensor, "prism focus row column"] | None = None
+    rest: int = 0
+
+    def to(self, formed: Float[Tensor, "prism focus row column"]) -> Float[Tensor, "prism focus row column"]:
+        """Images with the correction."""
+        return formed if self.added is None else formed + self.added
+
+    @torch.no_grad()
+    def renewed(
+        self,
+        setup: Setup,
+        formed: Float[Tensor, "prism focus row column"],
+        careful: Fidelity,
+        size: Callable[[Tensor], float],
+    ) -> "Correction":
+        """The correction at the setup's volume, or this one where it still serves.
+
+        formed: the draft images of that volume. careful: the fidelity of the images to which they are corrected.
+        size: of a change of images, in shares of what noise leaves.
+        """
+        if self.rest > 0:
+            return Correction(self.added, self.rest - 1)
+        added = setup.formed(careful) - formed.detach()
+        moved = size(added if self.added is None else added - self.added)
+        return Correction(added, REST if moved < SETTLED else 0)
+
+    def state(self) -> dict[str, Any]:
+        """Its values, for a checkpoint."""
+        return {"added": self.added, "rest": self.rest}
+
+
+def drafts(careful: Fidelity, sources: int | None) -> tuple[Fidelity, Fidelity]:
+    """The fidelities of the first steps and of the later ones: fewer directions, and no padding.
+
+    sources: directions of the later steps; None is all of the careful fidelity's.
+    """
+    fine = replace(careful, padding=0, order=1, sources=min(sources or careful.sources, careful.sources))
+    return replace(fine, sources=min(COARSE, fine.sources)), fine

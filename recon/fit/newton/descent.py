@@ -1,0 +1,392 @@
+"""A proximal Newton descent to the volume that explains the data, as a generator of steps.
+
+    minimise misfit(Δn) + weight·Σ priors(Δn),   lower ≤ Δn ≤ upper
+
+Each step replaces the misfit by a parabola with the weak specimen's Hessian and what earlier steps have shown of the
+true one, and the priors by their majorants, and minimises that (J. D. Lee, Y. Sun and M. A. Saunders, SIAM J. Optim.
+24, 1420, 2014). A step that doesn't lower the objective is taken back, and the next one is shorter: by the ratio of the
+actual to the predicted decrease (J. Moré's rule for λ of Levenberg and Marquardt).
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.newton.correction import Correction, drafts
+from recon.fit.newton.proximal import Penalties, Split, minimised
+from recon.fit.newton.secants import MEMORY, Pair, Secants
+from recon.fit.newton.weak_hessian import WeakHessian
+from recon.fit.nuisances.base import Nuisance
+from recon.fit.nuisances.refinement import refined
+from recon.fit.planned import PlanRecord
+from recon.fit.problem import Problem
+from recon.fit.setup import Setup
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference, with_values
+from recon.prior.base import Majorant, contrast, weighted
+from recon.prior.edges import EDGE
+from recon.prior.weight import WeightRecord, correlation
+from torchdic import Fidelity
+from torchdic.errors import UnstableError
+
+# λ over the Hessian's mean: at first, the least, and the factors by which the ratio of actual to predicted decrease
+# moves it (ratios above GOOD, below POOR, and below BAD, where the step is taken back).
+FIRST, LEAST = 0.3, 3e-3
+GOOD, POOR, BAD = 0.7, 0.3, 0.05
+SHORTER, LONGER, BACK = 2.0, 0.4, 4.0
+
+# Accepted steps before the priors know the specimen's contrast, and before the weight follows the noise.
+UNTIL_CONTRAST, UNTIL_WEIGHT = 3, 2
+
+# Edges are wide at first, by this factor from one accepted step to the next: a logarithm at once keeps false edges.
+WIDE, NARROWER = 1.0 / EDGE, 0.7
+
+# Steps with the fewest directions.
+COARSE_STEPS = 7
+
+# ADMM's penalty on differences, over the weight: 1/(this share of the width of an edge).
+PENALTY = 0.4
+
+# Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
+TIKHONOV = 0.03
+
+# A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
+STILL, STEADY = 1e-4, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a descent stands: all that is needed to go on, besides what the problem says.
+
+    delta: Δn (z, y, x). parameters: of the nuisances, by name. split: of the last model. correction: of the draft
+    images.
+    damping: λ over the Hessian's mean. weight: of the priors. contrast: of the specimen, times the width of edges over
+    the last one; 0 while the priors don't know it. scale: the same, known from the first step on. accepted: number of
+    steps that were. before: the misfit one accepted step earlier. moved: whether the last step was accepted. still:
+    accepted steps in a row that changed next to nothing. pairs: for the secants. records: of the weight.
+    """
+
+    delta: Float[Tensor, "z y x"]
+    parameters: dict[str, Tensor]
+    split: Split
+    correction: Correction
+    weight: float
+    scale: float
+    damping: float = FIRST
+    contrast: float = 0.0
+    width: float = WIDE
+    accepted: int = 0
+    before: float | None = None
+    moved: bool = True
+    still: int = 0
+    pairs: tuple[Pair, ...] = ()
+    records: tuple[WeightRecord, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Formed:
+    """The images that the microscope forms of a volume, with their graph.
+
+    delta: Δn, the graph's leaf. images: (prism, focus, row, column), as formed. misfit: with the nuisances and the
+    correction of the place that they were formed for; a 0-d tensor.
+    """
+
+    delta: Float[Tensor, "z y x"]
+    images: Float[Tensor, "prism focus row column"]
+    misfit: Float[Tensor, ""]
+
+    @property
+    def value(self) -> float:
+        """The misfit as a number."""
+        return float(self.misfit.detach())
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A volume's misfit, its gradient (z, y, x), and the recorded images of the model."""
+
+    misfit: float
+    gradient: Float[Tensor, "z y x"]
+    images: Float[Tensor, "prism focus y x"]
+
+
+def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
+    """Lower the misfit and the priors of a problem by Newton's method; yields every step, also those taken back.
+
+    It ends after the problem's steps, or where nothing changes any more. The unknowns are Δn and any nuisances.
+    resume: the step to go on from; the rest is as if there had been no interruption.
+    Raises ValueError where an unknown is neither Δn nor a nuisance or the step is of another descent, and
+    NotImplementedError for a prior without a majorant.
+    """
+    yield from _Descent(problem).steps(resume)
+
+
+class _Descent:
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        (self.index,) = (u for u in problem.unknowns if isinstance(u, IndexDifference))
+        self.nuisances = [u for u in problem.unknowns if isinstance(u, Nuisance)]
+        others = [u.name for u in problem.unknowns if u is not self.index and u not in self.nuisances]
+        if others:
+            raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}: fit with method 'adam'")
+        self.bounds = self.index.bounds
+        grid = problem.setup.volume.grid
+        self.ratio = grid.spacing[2] / grid.spacing[0]
+        self.voxels = math.prod(grid.shape)
+        self.plans: tuple[PlanRecord, ...] = ()
+
+    def steps(self, resume: Step | None) -> Iterator[Step]:
+        started, problem = time.perf_counter(), self.problem
+        place, first, seconds = None, 0, 0.0
+        if resume is not None:
+            place = _restored(resume.state, problem.misfit.data.device)
+            first, seconds, self.plans = resume.number, resume.seconds, resume.plans
+        careful = draft = hessian = now = None
+        for number in range(first, problem.steps):
+            setup = self.placed(place)
+            careful, self.plans = problem.fidelity.at(number, problem.steps, setup, self.plans)
+            coarse, fine = drafts(careful, problem.fidelity.draft_sources)
+            wanted = coarse if number < COARSE_STEPS else fine
+            if wanted != draft:
+                draft = wanted
+                hessian = self.hessian(setup, draft)
+                if place is None:
+                    place = self.start(hessian, draft)
+                elif number == COARSE_STEPS:
+                    place = replace(place, pairs=(), correction=Correction())
+                now = None
+            assert place is not None
+            assert hessian is not None
+            assert draft is not None
+            exact = careful if number >= COARSE_STEPS and careful != draft else None
+            if now is None:
+                formed = self.formed(place, draft)
+                if number == COARSE_STEPS:
+                    now, place = self.renewed(place, formed, draft, exact)
+                else:
+                    now = self.judged(place, formed)
+            place = self.weighted(place, now, number)
+            loss = now.misfit + self.penalty(place, place.delta, number)
+            misfit = now.misfit
+            place, now = self.advanced(place, now, hessian, (draft, exact), number)
+            taken = seconds + time.perf_counter() - started
+            values = self.values(place)
+            yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
+            if place.still >= 2 and number >= COARSE_STEPS:
+                return
+
+    # --- what the model says of a place -------------------------------------------------------------------------------
+
+    def values(self, place: Place) -> dict[str, Tensor]:
+        """Δn and the values of the nuisances, by name."""
+        return {self.index.name: place.delta, **{u.name: u.value(place.parameters[u.name]) for u in self.nuisances}}
+
+    def placed(self, place: Place | None, delta: Tensor | None = None) -> Setup:
+        """The setup with the values of a place, or another Δn in it; the problem's own before the first place."""
+        if place is None:
+            return self.problem.setup
+        values = self.values(place)
+        setup = with_values(self.nuisances, values, self.problem.setup)
+        return self.index.put(place.delta if delta is None else delta, setup)
+
+    def formed(self, place: Place, draft: Fidelity) -> Formed:
+        """The images of a place's volume and their misfit. Raises UnstableError where the slabs make energy."""
+        delta = place.delta.detach().requires_grad_()
+        setup = self.placed(place, delta)
+        images = setup.formed(draft)
+        return Formed(delta, images, self.problem.misfit(setup.recorded(place.correction.to(images))))
+
+    def judged(self, place: Place, formed: Formed) -> Judged:
+        """The misfit and its gradient of a place, with its nuisances and its correction as they are."""
+        (gradient,) = torch.autograd.grad(formed.misfit, formed.delta)
+        with torch.no_grad():
+            images = self.placed(place).recorded(place.correction.to(formed.images.detach()))
+        return Judged(formed.value, gradient, images)
+
+    def renewed(self, place: Place, formed: Formed, draft: Fidelity, exact: Fidelity | None) -> tuple[Judged, Place]:
+        """The misfit and its gradient of a place whose correction and nuisances are renewed before.
+
+        exact: the careful fidelity to which the images are corrected; None corrects nothing.
+        """
+        if exact is not None:
+            correction = place.correction.renewed(self.placed(place), formed.images, exact, self.size)
+            place = replace(place, correction=correction)
+        changed = False
+        if self.nuisances and place.accepted > 0:
+            place, changed = self.refined(place, formed.images.detach(), draft)
+        if changed:
+            formed = self.formed(place, draft)
+        else:
+            setup = self.placed(place, formed.delta)
+            misfit = self.problem.misfit(setup.recorded(place.correction.to(formed.images)))
+            formed = Formed(formed.delta, formed.images, misfit)
+        return self.judged(place, formed), place
+
+    def refined(self, place: Place, formed: Tensor, draft: Fidelity) -> tuple[Place, bool]:
+        """The place with its nuisances refined, and whether other images must be formed for them."""
+        setup = self.index.put(place.delta, self.problem.setup)
+        images = place.correction.to(formed)
+        found = refined(self.nuisances, place.parameters, setup, self.problem.misfit, draft, images)
+        changed = any(u.forms and not torch.equal(found[u.name], place.parameters[u.name]) for u in self.nuisances)
+        return replace(place, parameters=found), changed
+
+    def size(self, change: Float[Tensor, "prism focus row column"]) -> float:
+        """The mean square of a change of images, relative to what noise leaves of it, or to a thousandth of all."""
+        misfit = self.problem.misfit
+        share = float((change.square().mean((1, 2, 3)) / misfit.variance.flatten()).mean())
+        noise = self.problem.weight.noise_misfit if self.problem.weight is not None else None
+        return share / max(noise or 0.0, 1e-3)
+
+    def hessian(self, setup: Setup, draft: Fidelity) -> WeakHessian:
+        """The weak specimen's Hessian, with the misfit's curvature at its data, for the directions of a draft."""
+        misfit = self.problem.misfit
+        curvature = misfit.curvature(misfit.data).expand(misfit.data.shape).mean((2, 3))
+        return WeakHessian(setup, self.voxels * curvature, draft, draft.memory // 2)
+
+    def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
+        """The priors with their weights at a step, for the contrast that is known."""
+        priors = [prior.at_contrast(place.contrast * place.width) for prior in self.problem.priors]
+        factor = 1.0 if self.problem.weight is None else place.weight
+        return weighted(priors, factor, number, self.problem.steps)
+
+    def penalty(self, place: Place, delta: Tensor, number: int) -> float:
+        """The weighted priors of a Δn."""
+        volume = self.index.put(delta, self.problem.setup).volume
+        return sum(weight * float(prior(volume)) for weight, prior in self.priors(place, number))
+
+    def majorant(self, place: Place, number: int) -> Majorant:
+        """The sum of the priors' majorants at a place."""
+        volume = self.index.put(place.delta, self.problem.setup).volume
+        return sum((weight * prior.majorant(volume) for weight, prior in self.priors(place, number)), Majorant())
+
+    # --- steps --------------------------------------------------------------------------------------------------------
+
+    def start(self, hessian: WeakHessian, draft: Fidelity) -> Place:
+        """The empty volume, and the contrast and weight that a first linear estimate suggests."""
+        problem = self.problem
+        delta = problem.misfit.data.new_zeros(problem.setup.volume.grid.shape)
+        delta = delta.clamp(self.bounds.lower, self.bounds.upper)
+        parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
+        place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
+        now = self.judged(place, self.formed(place, draft))
+        inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
+        linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
+        scale = contrast(linear.clamp(self.bounds.lower, self.bounds.upper))
+        scale = max(scale, contrast(linear) * 1e-3, 1e-9)
+        first = None if problem.weight is None else problem.weight.first
+        return replace(place, scale=scale, weight=first if first is not None else 1 / (EDGE * scale))
+
+    def weighted(self, place: Place, now: Judged, number: int) -> Place:
+        """The place with the priors' contrast and weight for the next step."""
+        if place.moved and place.accepted >= UNTIL_CONTRAST:
+            width = WIDE if place.contrast == 0 else max(1.0, NARROWER * place.width)
+            found = contrast(place.delta)
+            if found > 0 and (place.contrast == 0 or place.width > 1.0):
+                place = replace(place, contrast=found, width=width, scale=found)
+        rule = self.problem.weight
+        if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
+            return place
+        rho = correlation(now.images, self.problem.misfit)
+        before = place.before if number != COARSE_STEPS else None
+        weight, reason = rule.next(place.weight, now.misfit, before, rho)
+        record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "correlation": rho, "reason": reason}
+        return replace(place, weight=weight, records=(*place.records, record))
+
+    def advanced(
+        self, place: Place, now: Judged, hessian: WeakHessian, drafted: tuple[Fidelity, Fidelity | None], number: int
+    ) -> tuple[Place, Judged]:
+        """One step: the model's minimum, and whether it is taken.
+
+        drafted: the fidelity of the images, and the careful one to which they are corrected, if they are.
+        """
+        damping, majorant = place.damping * hessian.mean, self.majorant(place, number)
+        secants = Secants(lambda delta: hessian(delta) + damping * delta, place.pairs)
+        width = EDGE * place.scale * (place.width if place.contrast > 0 else 1.0)
+        total = sum(weight for weight, prior in self.priors(place, number)) or 1.0
+        tie = Penalties(total / (PENALTY * width), hessian.mean)
+        inverse = hessian.inverse(tie.edges + majorant.rough, tie.copy + damping)
+        solve = secants.solved(lambda right: hessian.solved(inverse, right))
+        curved = hessian(place.delta) + secants(place.delta)
+        right = curved + damping * place.delta - self.voxels * now.gradient
+        trial, split = minimised(solve, right, majorant, self.bounds, place.split, tie, self.ratio)
+
+        step = trial - place.delta
+        penalties = self.penalty(place, trial, number) - self.penalty(place, place.delta, number)
+        bent = float((step * (hessian(step) + secants(step))).sum()) / self.voxels
+        predicted = float((now.gradient * step).sum()) + bent / 2 + penalties
+        onward = replace(place, delta=trial, split=split)
+        formed = self.tried(onward, drafted[0])
+        if formed is None:
+            return self.taken_back(place), now
+        actual = formed.value - now.misfit + penalties
+        share = actual / predicted if predicted < 0 else (0.5 if actual < 0 else -1.0)
+        if share < BAD:
+            there = self.judged(onward, formed)
+            return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
+        factor = LONGER if share > GOOD else SHORTER if share < POOR else 1.0
+        objective = now.misfit + self.penalty(place, place.delta, number)
+        onward = replace(
+            onward,
+            damping=max(factor * place.damping, LEAST),
+            accepted=place.accepted + 1,
+            before=now.misfit,
+            moved=True,
+            still=place.still + 1 if -actual < STILL * objective and self.steady(place) else 0,
+        )
+        there, onward = self.renewed(onward, formed, *drafted)
+        return replace(onward, pairs=self.remembered(place, now, there, step)), there
+
+    def remembered(self, place: Place, now: Judged, there: Judged, step: Tensor) -> tuple[Pair, ...]:
+        """The pairs with that of a step added."""
+        return (*place.pairs, (step, self.voxels * (there.gradient - now.gradient)))[-MEMORY:]
+
+    def tried(self, place: Place, draft: Fidelity) -> Formed | None:
+        """The images of a trial, with the nuisances and the correction as they are; None where it makes energy."""
+        try:
+            formed = self.formed(place, draft)
+        except UnstableError:
+            return None
+        return formed if math.isfinite(formed.value) else None
+
+    def taken_back(self, place: Place) -> Place:
+        """The place before a step that failed, with more damping."""
+        return replace(place, damping=BACK * place.damping, split=Split.at(place.delta), moved=False, still=0)
+
+    def steady(self, place: Place) -> bool:
+        """Whether the weight has all but stopped moving."""
+        if len(place.records) < 2:
+            return self.problem.weight is None
+        last, previous = place.records[-1]["tv"], place.records[-2]["tv"]
+        return abs(math.log(last / previous)) < STEADY
+
+
+def _state(place: Place) -> dict[str, dict[str, Any]]:
+    """A place as plain values and tensors, for a checkpoint."""
+    numbers = {f.name: getattr(place, f.name) for f in fields(Place)}
+    for name in ("delta", "parameters", "split", "correction"):
+        del numbers[name]
+    return {
+        "delta": {"parameter": place.delta},
+        **{name: {"parameter": parameter} for name, parameter in place.parameters.items()},
+        "newton": {**numbers, "split": vars(place.split), "correction": place.correction.state()},
+    }
+
+
+def _restored(state: dict[str, dict[str, Any]], device: torch.device) -> Place:
+    """The place that `_state` saved."""
+    if "newton" not in state:
+        raise ValueError("the saved step is none of Newton's method")
+    saved = dict(state["newton"])
+    split = Split(**{name: value.to(device) for name, value in saved.pop("split").items()})
+    correction = saved.pop("correction")
+    added = None if correction["added"] is None else correction["added"].to(device)
+    saved["pairs"] = tuple((a.to(device), b.to(device)) for a, b in saved["pairs"])
+    parameters = {n: v["parameter"].to(device) for n, v in state.items() if n not in ("delta", "newton")}
+    delta = state["delta"]["parameter"].to(device)
+    return Place(delta, parameters, split, Correction(added, correction["rest"]), **saved)

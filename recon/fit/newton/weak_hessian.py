@@ -1,0 +1,133 @@
+"""The misfit's curvature as a weak specimen has it: one matrix of depths for each lateral frequency.
+
+To first order in Δn an image is Σ_z F⁻¹[T(f; z_f − z)·F{Δn(z)}] (`torchdic.linear`), so that with a weight c for each
+image the Hessian of the misfit is, for each frequency f, the matrix A(z, z') = Σ c·conj(T(z))·T(z'). It is kept for
+cosines along z instead of slices (the DCT-II), for two reasons. Light sees no faster change along z than the difference
+of its axial frequencies, so a matrix of the lowest cosines holds all of A but its noise. And the differences along z,
+which the priors need, are diagonal in cosines.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from recon.fit.setup import Setup
+from torchdic import Acquisition, Fidelity
+from torchdic.linear import transfer_functions
+from torchdic.scalar import number
+
+# Added to the diagonal: this share of its mean. It holds what no image shows.
+DAMPING = 0.01
+
+# Cosines beyond the band limit that are kept: the volume's faces make every wave a little wider.
+BEYOND = 3
+
+# An inverse: the matrices of the lowest cosines, and the reciprocals of the others' diagonals.
+Inverse = tuple[Complex[Tensor, "y x low low"], Float[Tensor, "y x high"]]
+
+
+class WeakHessian:
+    """The Hessian of a misfit times the number of voxels, for the means that the priors are.
+
+    setup: of which the weak specimen is one; its volume's Δn plays no part. weights: of each image (prism, focus), the
+    misfit's curvature by one of its pixels times the number of voxels. fidelity: its sources and steps count, and
+    should be those of the images, because others respond otherwise. memory: bytes that the matrices may take; with less
+    than all take, fewer cosines share a matrix, and the others keep their diagonal.
+    """
+
+    def __init__(self, setup: Setup, weights: Float[Tensor, "prism focus"], fidelity: Fidelity, memory: int) -> None:
+        grid = setup.volume.grid
+        self._sides = grid.shape[1:]
+        self._cosines = cosines(grid.shape[0]).to(weights)
+        frequencies = grid.shape[1] * (grid.shape[2] // 2 + 1)
+        each = 3 * frequencies * weights.element_size() * 2  # a matrix's entry, its inverse, and one to invert it
+        self.kept = max(1, min(grid.shape[0], axial_band(setup), math.isqrt(memory // each)))
+
+        matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, self.kept, self.kept).to(torch.complex64)
+        matrix = matrix.to(torch.promote_types(weights.dtype, torch.complex64))
+        beyond = weights.new_zeros(*matrix.shape[:2], grid.shape[0] - self.kept)
+        for index, focus in enumerate(setup.acquisition.focus):
+            T = self._responses(setup, focus, weights[:, index], fidelity)
+            low = T[..., : self.kept]
+            matrix += low.mH @ low
+            beyond += T[..., self.kept :].abs().square().sum(2)
+        power = matrix.diagonal(dim1=-2, dim2=-1).real.sum() + beyond.sum()
+        self.mean = float(power) / (frequencies * grid.shape[0])
+        self._matrix, self._beyond = matrix, beyond + DAMPING * self.mean
+        matrix.diagonal(dim1=-2, dim2=-1).add_(DAMPING * self.mean)
+        self._differences = squared_differences(grid.shape, grid.spacing[2] / grid.spacing[0]).to(weights)
+
+    def _responses(
+        self, setup: Setup, focus: float | Tensor, weights: Float[Tensor, " prism"], fidelity: Fidelity
+    ) -> Complex[Tensor, "y x prism cosine"]:
+        """The images' responses at one focus to each cosine, times the roots of the images' weights."""
+        one = Acquisition(setup.acquisition.prisms, (number(focus),))
+        microscope = replace(setup.microscope, camera=None)
+        volume = setup.volume
+        given = {"dtype": weights.dtype, "device": weights.device}
+        T = transfer_functions(volume.grid, microscope, one, number(volume.background), fidelity, **given)[:, 0]
+        T = T[..., : volume.grid.shape[2] // 2 + 1] * weights.sqrt()[:, None, None, None]
+        return T.permute(2, 3, 0, 1) @ self._cosines.mT.to(T.dtype)
+
+    def spectrum(self, delta: Float[Tensor, "z y x"]) -> Complex[Tensor, "y x cosine"]:
+        """Δn in cosines along z and waves along y and x; orthonormal."""
+        waves = torch.fft.rfft2(torch.tensordot(self._cosines, delta, 1), norm="ortho")
+        return waves.permute(1, 2, 0).contiguous()
+
+    def volume(self, spectrum: Complex[Tensor, "y x cosine"]) -> Float[Tensor, "z y x"]:
+        """The inverse of `spectrum`."""
+        waves = torch.fft.irfft2(spectrum.permute(2, 0, 1), s=self._sides, norm="ortho")
+        return torch.tensordot(self._cosines.mT, waves, 1)
+
+    def __call__(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """The Hessian times a volume."""
+        return self._times((self._matrix, self._beyond), delta)
+
+    def inverse(self, differences: float, constant: float) -> Inverse:
+        """The inverse of the Hessian + differences·DᵀD + constant, for `solved`; D are the `forward_differences`."""
+        more = differences * self._differences + constant
+        matrix = self._matrix.clone()
+        matrix.diagonal(dim1=-2, dim2=-1).add_(more[..., : self.kept])
+        return torch.linalg.inv(matrix), 1 / (self._beyond + more[..., self.kept :])
+
+    def solved(self, inverse: Inverse, right: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
+        """An inverse times a volume."""
+        return self._times(inverse, right)
+
+    def _times(self, operator: Inverse, delta: Tensor) -> Tensor:
+        S = self.spectrum(delta)
+        low = (operator[0] @ S[..., : self.kept, None])[..., 0]
+        return self.volume(torch.cat([low, operator[1] * S[..., self.kept :]], -1))
+
+
+def axial_band(setup: Setup) -> int:
+    """Number of cosines along z that light can tell apart.
+
+    A pair of waves at angles up to the larger aperture beats along z with (p_z(0) − p_z(NA))/λ at most, and cosine k
+    has the frequency k/(2·depth).
+    """
+    microscope, background = setup.microscope, number(setup.volume.background)
+    apertures = [part.na for part in (microscope.objective, microscope.condenser) if part is not None]
+    na = min(max(apertures, default=background), background) if microscope.objective is not None else background
+    highest = (background - math.sqrt(max(background**2 - na**2, 0.0))) / microscope.wavelength
+    return math.ceil(2 * setup.volume.grid.extent[0] * highest) + BEYOND
+
+
+def cosines(number: int) -> Float[Tensor, "cosine z"]:
+    """The orthonormal DCT-II as a matrix, float64."""
+    k, z = torch.arange(number, dtype=torch.float64)[:, None], torch.arange(number, dtype=torch.float64)
+    matrix = torch.cos(math.pi * k * (z + 0.5) / number) * math.sqrt(2 / number)
+    matrix[0] /= math.sqrt(2)
+    return matrix
+
+
+def squared_differences(shape: tuple[int, int, int], ratio: float) -> Float[Tensor, "y x cosine"]:
+    """DᵀD of the `forward_differences`, which is diagonal in waves along y and x and cosines along z; float64."""
+    nz, ny, nx = shape
+    along_y, along_x = torch.fft.fftfreq(ny, dtype=torch.float64), torch.fft.rfftfreq(nx, dtype=torch.float64)
+    along_z = torch.arange(nz, dtype=torch.float64) / (2 * nz)
+    y, x, z = (2 - 2 * torch.cos(2 * math.pi * f) for f in (along_y, along_x, along_z))
+    return y[:, None, None] + x[:, None] + ratio**2 * z

@@ -1,0 +1,120 @@
+"""Priors of edges: there are few of them, or none."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.prior.base import Majorant, Prior
+from recon.prior.schedule import held_then_annealed
+from torchdic import Volume
+
+# Rounds off the corner of |∇Δn| at 0. It is far below any contrast that DIC sees.
+SMOOTHING = 1e-5
+
+# Edges from this share of the specimen's Δn on count less than in proportion to their height.
+EDGE = 0.35
+
+
+def differences(
+    delta: Float[Tensor, "z y x"], spacing: tuple[float, float, float]
+) -> tuple[Float[Tensor, "z y x"], ...]:
+    """Differences to the next voxel along z, y and x, each scaled to the spacing along x; 0 behind the last voxel."""
+    return tuple(
+        delta.diff(dim=axis, append=delta.narrow(axis, -1, 1)) * (spacing[2] / step)
+        for axis, step in enumerate(spacing)
+        if delta.shape[axis] > 1
+    )
+
+
+def gradient_length(delta: Float[Tensor, "z y x"], spacing: tuple[float, float, float]) -> Float[Tensor, "z y x"]:
+    """|∇Δn| times the spacing along x, at least SMOOTHING."""
+    squares = delta.new_full(delta.shape, SMOOTHING**2)
+    for difference in differences(delta, spacing):
+        squares = squares + difference.square()
+    return squares.sqrt()
+
+
+def total_variation(delta: Float[Tensor, "z y x"], spacing: tuple[float, float, float]) -> Float[Tensor, ""]:
+    """Mean length of the differences to the next voxel along z, y and x, each scaled to the spacing along x."""
+    return gradient_length(delta, spacing).mean()
+
+
+@dataclass(frozen=True)
+class Edges(Prior):
+    """What the priors of edges share: a weight that is held and then annealed, as `held_then_annealed` says.
+
+    first, last: the weight. With a weight that follows the noise, both are 1.
+    """
+
+    first: float = 1.0
+    last: float = 1.0
+
+    def weight(self, step: int, steps: int) -> float:
+        """The weight at one of the steps."""
+        return held_then_annealed(step, steps, self.first, self.last)
+
+
+@dataclass(frozen=True)
+class TotalVariation(Edges):
+    """Few and sharp edges: `total_variation` of Δn."""
+
+    def __call__(self, volume: Volume) -> Float[Tensor, ""]:
+        """Total variation of the volume's Δn."""
+        return total_variation(volume.delta, volume.grid.spacing)
+
+    def majorant(self, volume: Volume) -> Majorant:
+        """It is its own."""
+        return Majorant(edges=1.0)
+
+
+@dataclass(frozen=True)
+class LogTotalVariation(Edges):
+    """Few edges, however high: mean ε·log(1 + |∇Δn|/ε). Total variation takes a part of every edge's height; this
+    takes less the higher the edge.
+
+    ε is EDGE of the specimen's contrast, so that the prior is the same for weak and strong specimens.
+    width: ε; None, before the contrast is known, is plain total variation.
+
+    E. J. Candès, M. B. Wakin and S. P. Boyd, J. Fourier Anal. Appl. 14, 877 (2008).
+    """
+
+    width: float | None = None
+
+    def __call__(self, volume: Volume) -> Float[Tensor, ""]:
+        """The term's value without its weight."""
+        length = gradient_length(volume.delta, volume.grid.spacing)
+        return length.mean() if self.width is None else self.width * torch.log1p(length / self.width).mean()
+
+    def majorant(self, volume: Volume) -> Majorant:
+        """The tangent of the logarithm: total variation weighted by 1/(1 + |∇Δn|/ε)."""
+        if self.width is None:
+            return Majorant(edges=1.0)
+        return Majorant(edges=1 / (1 + gradient_length(volume.delta, volume.grid.spacing) / self.width))
+
+    def at_contrast(self, contrast: float) -> Prior:
+        """With ε for a specimen of this contrast."""
+        return replace(self, width=EDGE * contrast) if contrast > 0 else self
+
+
+@dataclass(frozen=True)
+class Smoothness(Edges):
+    """No edges, for graded specimens: mean |∇Δn|²/(2ε), with ε as in `LogTotalVariation`.
+
+    width: ε; None, before the contrast is known, is 0.01.
+    """
+
+    width: float | None = None
+
+    def __call__(self, volume: Volume) -> Float[Tensor, ""]:
+        """The term's value without its weight."""
+        return gradient_length(volume.delta, volume.grid.spacing).square().mean() / (2 * (self.width or 0.01))
+
+    def majorant(self, volume: Volume) -> Majorant:
+        """It is its own."""
+        return Majorant(rough=1 / (self.width or 0.01))
+
+    def at_contrast(self, contrast: float) -> Prior:
+        """With ε for a specimen of this contrast."""
+        return replace(self, width=EDGE * contrast) if contrast > 0 else self

@@ -1,0 +1,46 @@
+"""The misfit that a configuration names, for the stack that it was given."""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from recon.config.schema import Config, ConfigError
+from recon.misfit.base import Misfit
+from recon.misfit.gaussian import GaussianMisfit
+from recon.misfit.poisson import PoissonMisfit
+from recon.misfit.robust import RobustMisfit
+from recon.recording.noise import NoiseModel, noise_of_level
+from recon.recording.preparation import Measured
+
+
+def misfit_for(config: Config, measured: Measured) -> Callable[[Tensor], Misfit]:
+    """What makes the configuration's misfit from the prepared images.
+
+    Without a gain in [data], the Gaussian misfit goes by one noise for each prism, and the Poisson misfit by the gain
+    that the stack shows. Raises ConfigError where that shows none.
+    """
+    named, model = config.reconstruction.misfit, _noise_model(config, measured)
+    if named == "robust":
+        levels = [report.noise for report in measured.prisms]
+        known = [level for level in levels if level]
+        noise = torch.tensor(known) if len(known) == len(levels) else None
+        return lambda data: RobustMisfit(data, noise)
+    if named == "gaussian":
+        return lambda data: GaussianMisfit(data, model)
+    model = model or noise_of_level(measured.data)
+    if model is None:
+        raise ConfigError(
+            "reconstruction.misfit: 'poisson' needs data.gain, counts per photoelectron: the noise of this stack "
+            "doesn't tell it; use 'gaussian'"
+        )
+    return lambda data: PoissonMisfit(data, model)
+
+
+def _noise_model(config: Config, measured: Measured) -> NoiseModel | None:
+    """Shot and read noise in the unit of the prepared images, where the configuration gives the camera's gain."""
+    section = config.data
+    if section is None or section.gain is None:
+        return None
+    unit = torch.tensor([report.scale for report in measured.prisms])[:, None, None, None]
+    return NoiseModel(section.gain, section.read_noise).in_unit(unit)
