@@ -26,7 +26,7 @@ DAMPING = 0.01
 BEYOND = 3
 
 # An inverse: the matrices of the lowest cosines, and the reciprocals of the others' diagonals.
-Inverse = tuple[Complex[Tensor, "y x low low"], Float[Tensor, "y x high"]]
+Inverse = tuple[Complex[Tensor, "y half low low"], Float[Tensor, "y half high"]]
 
 
 class WeakHessian:
@@ -62,7 +62,7 @@ class WeakHessian:
 
     def _responses(
         self, setup: Setup, focus: float | Tensor, weights: Float[Tensor, " prism"], fidelity: Fidelity
-    ) -> Complex[Tensor, "y x prism cosine"]:
+    ) -> Complex[Tensor, "y half prism cosine"]:
         """The images' responses at one focus to each cosine, times the roots of the images' weights."""
         one = Acquisition(setup.acquisition.prisms, (number(focus),))
         microscope = replace(setup.microscope, camera=None)
@@ -72,12 +72,12 @@ class WeakHessian:
         T = T[..., : volume.grid.shape[2] // 2 + 1] * weights.sqrt()[:, None, None, None]
         return T.permute(2, 3, 0, 1) @ self._cosines.mT.to(T.dtype)
 
-    def spectrum(self, delta: Float[Tensor, "z y x"]) -> Complex[Tensor, "y x cosine"]:
+    def spectrum(self, delta: Float[Tensor, "z y x"]) -> Complex[Tensor, "y half cosine"]:
         """Δn in cosines along z and waves along y and x; orthonormal."""
         waves = torch.fft.rfft2(torch.tensordot(self._cosines, delta, 1), norm="ortho")
         return waves.permute(1, 2, 0).contiguous()
 
-    def volume(self, spectrum: Complex[Tensor, "y x cosine"]) -> Float[Tensor, "z y x"]:
+    def volume(self, spectrum: Complex[Tensor, "y half cosine"]) -> Float[Tensor, "z y x"]:
         """The inverse of `spectrum`."""
         waves = torch.fft.irfft2(spectrum.permute(2, 0, 1), s=self._sides, norm="ortho")
         return torch.tensordot(self._cosines.mT, waves, 1)
@@ -124,7 +124,7 @@ def cosines(number: int) -> Float[Tensor, "cosine z"]:
     return matrix
 
 
-def squared_differences(shape: tuple[int, int, int], ratio: float) -> Float[Tensor, "y x cosine"]:
+def squared_differences(shape: tuple[int, int, int], ratio: float) -> Float[Tensor, "y half cosine"]:
     """DᵀD of the `forward_differences`, which is diagonal in waves along y and x and cosines along z; float64."""
     nz, ny, nx = shape
     along_y, along_x = torch.fft.fftfreq(ny, dtype=torch.float64), torch.fft.rfftfreq(nx, dtype=torch.float64)
