@@ -40,6 +40,10 @@ class Bounds:
             return upper - F.softplus(-parameter, beta=SHARPNESS)
         return parameter
 
+    def clamped(self, delta: Tensor) -> Tensor:
+        """Δn moved to the nearest value within the bounds."""
+        return delta if self.lower is None and self.upper is None else delta.clamp(self.lower, self.upper)
+
     def parameter(self, delta: Tensor, margin: float) -> Tensor:
         """The parameter whose Δn is the given one, first moved to at least `margin` (in Δn) from each bound."""
         lower, upper = self.lower, self.upper

@@ -271,13 +271,13 @@ class _Descent:
         """The empty volume, and the contrast and weight that a first linear estimate suggests."""
         problem = self.problem
         delta = problem.misfit.data.new_zeros(problem.setup.volume.grid.shape)
-        delta = delta.clamp(self.bounds.lower, self.bounds.upper)
+        delta = self.bounds.clamped(delta)
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
         place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
         now = self.judged(place, self.formed(place, draft))
         inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
         linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
-        scale = contrast(linear.clamp(self.bounds.lower, self.bounds.upper))
+        scale = contrast(self.bounds.clamped(linear))
         scale = max(scale, contrast(linear) * 1e-3, 1e-9)
         first = None if problem.weight is None else problem.weight.first
         return replace(place, scale=scale, weight=first if first is not None else 1 / (EDGE * scale))

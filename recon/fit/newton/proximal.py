@@ -70,7 +70,7 @@ def minimised(
         length = raised.square().sum(0).sqrt_().clamp_min_(torch.finfo(free.dtype).tiny)
         edges = raised * (1 - shrink / length).clamp_min_(0)
         lifted = free + v
-        delta = (lifted.sign() * (lifted.abs() - threshold).clamp_min(0)).clamp(bounds.lower, bounds.upper)
+        delta = bounds.clamped(lifted.sign() * (lifted.abs() - threshold).clamp_min(0))
         u, v = raised - edges, lifted - delta
         pull = adjoint_differences(edges - u, ratio).mul_(penalties.edges)
         free = solve(right + pull.add_(delta - v, alpha=penalties.copy))
