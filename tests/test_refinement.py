@@ -8,9 +8,9 @@ from absolute import Absolute
 from distant import Device, bring, send
 
 from data_synthetic import GaussianBall
-from recon.fit.nuisances import refinement
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
+from recon.fit.nuisances import refinement
 from recon.fit.nuisances.bias import Bias, CommonBias
 from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift

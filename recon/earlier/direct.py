@@ -32,7 +32,7 @@ def solved_directly(
         found = path_length(data, problem.setup, noise)
         sections = found.opl
     weight = found.weight if math.isfinite(found.weight) else None
-    record = {"step": 1, "tv": weight, "misfit": math.nan, "correlation": math.nan, "reason": found.rule}
+    record = {"step": 1, "tv": weight, "misfit": math.nan, "white": math.nan, "reason": found.rule}
     seconds = time.perf_counter() - started
     values = {u.name: u.value(u.start(problem.setup, problem.misfit)) for u in problem.unknowns[1:]}
     values[IndexDifference.name] = found.delta

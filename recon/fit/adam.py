@@ -14,7 +14,7 @@ from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import FollowsNoise, WeightRecord, correlation
+from recon.prior.weight import FollowsNoise, WeightRecord, whiteness
 from torchdic.errors import UnstableError
 
 # Share of the steps before the priors know the specimen's contrast, and steps between two weights that follow the
@@ -95,7 +95,7 @@ def _first_weight(problem: Problem, unknowns: Unknowns) -> tuple[WeightRecord, .
         return ()
     found = contrast(unknowns.into(problem.setup).volume.delta.detach())
     first = rule.first if rule.first is not None else 1 / (EDGE * max(found, 1e-4))
-    return ({"step": 0, "tv": first, "misfit": math.nan, "correlation": math.nan, "reason": "by the contrast"},)
+    return ({"step": 0, "tv": first, "misfit": math.nan, "white": math.nan, "reason": "by the contrast"},)
 
 
 def _followed(
@@ -112,9 +112,9 @@ def _followed(
         if step == 0:
             return weights
         before = math.inf
-    rho = correlation(images, problem.misfit)
-    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, rho)
-    return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "correlation": rho, "reason": reason})
+    white = whiteness(images, problem.misfit)
+    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, white)
+    return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "white": white, "reason": reason})
 
 
 def _check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:

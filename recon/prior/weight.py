@@ -2,9 +2,12 @@
 
 The true specimen leaves the noise's misfit (V. A. Morozov's discrepancy principle). A volume that leaves less follows
 the noise, and gets more weight; one that leaves more is held back by the prior, and gets less.
+
+A per cent of the noise's variance changes the weight by a third, and before the fit no noise is known as well as that.
+The residual tells it: what the specimen scatters lies at low frequencies, noise is as strong at high ones. Where the
+residual's high frequencies are as strong as all, it is white, and no more of the specimen is left in it.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +26,12 @@ GAIN, TWICE = 15.0, 2.0
 # A misfit that fell by more than this share in the last step is still on its way.
 FALLING = 0.03
 
-# Above this times its aim a misfit that no longer falls is held up by the model, or by a noise that was measured too
-# low.
-HELD_UP = 1.05
+# Frequencies above this many cycles per pixel, along y or x, are high.
+HIGH = 0.25
 
-# Lag-1 correlation of the residual above which it still shows the specimen; gain by which the weight follows it.
-WHITE, CORRELATION_GAIN = 0.005, 15.0
+# The residual's noise is believed within these factors of the noise that was measured in the images: below lies what is
+# smooth from pixel to pixel, above what the model can't show.
+LEAST, MOST = 0.93, 1.2
 
 # What the weight was at a step, the misfit and the residual's correlation there, and why it was changed, or not.
 WeightRecord = dict[str, Any]
@@ -38,45 +41,43 @@ WeightRecord = dict[str, Any]
 class FollowsNoise:
     """The common weight of the priors as a descent goes on.
 
-    noise_misfit: what noise alone leaves of the misfit; None where the noise isn't known: then the residual is to be
-    white. first: the weight at first; None is chosen by the specimen's contrast.
+    noise_misfit: what noise alone leaves of the misfit, as it was measured in the images; None where it wasn't: then
+    the residual alone tells it. first: the weight at first; None is chosen by the specimen's contrast.
     """
 
     noise_misfit: float | None
     first: float | None = None
 
-    @property
-    def aim(self) -> float | None:
-        """The misfit that is aimed at."""
-        return None if self.noise_misfit is None else self.noise_misfit + MODEL * max(0.0, 1 - self.noise_misfit)
+    def aim(self, misfit: float, white: float) -> float:
+        """The misfit that is aimed at. misfit, white: of the current volume, see `whiteness`."""
+        noise = misfit * white
+        if self.noise_misfit is not None:
+            noise = min(max(noise, LEAST * self.noise_misfit), MOST * self.noise_misfit)
+        return noise + MODEL * max(0.0, 1 - noise)
 
-    def next(self, weight: float, misfit: float, before: float | None, correlation: float) -> tuple[float, str]:
+    def next(self, weight: float, misfit: float, before: float | None, white: float) -> tuple[float, str]:
         """The next weight, and the reason.
 
-        misfit: of the current volume. before: the misfit one accepted step earlier; None at first. correlation: of the
-        current residual, see `correlation`.
+        misfit: of the current volume. before: the misfit one accepted step earlier; None at first. white: `whiteness`
+        of the current residual.
         """
-        aim = self.aim
-        falling = before is not None and misfit < (1 - FALLING) * before
-        if falling and (aim is None or misfit > aim):
+        aim = self.aim(misfit, white)
+        if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"
-        if aim is None or (misfit > HELD_UP * aim and correlation <= WHITE):
-            if aim is not None and correlation >= -WHITE:
-                return weight, "the residual is white, though above the noise"
-            factor = math.exp(min(max(-CORRELATION_GAIN * correlation, -math.log(TWICE)), math.log(TWICE)))
-            return weight * factor, "towards a white residual"
-        return weight * min(max((aim / misfit) ** GAIN, 1 / TWICE), TWICE), "towards the noise"
+        factor = min(max((aim / misfit) ** GAIN, 1 / TWICE), TWICE)
+        return weight * factor, "the volume follows the noise" if factor > 1 else "the priors hold the volume back"
 
 
-def correlation(images: Float[Tensor, "prism focus y x"], misfit: Misfit) -> float:
-    """Correlation of the residual with itself one pixel further, averaged over y and x: 0 for white noise.
+def whiteness(images: Float[Tensor, "prism focus y x"], misfit: Misfit) -> float:
+    """Power of the residual's high frequencies over that of all, per frequency: 1 for noise that is white.
 
-    images: the model's. Each image's mean residual is taken out; masked pixels count as 0.
+    images: the model's. Each image's mean residual is taken out; masked pixels count as 0. 1 for images that are too
+    small to have high frequencies.
     """
     residual = misfit.where_counted(images - misfit.data)
     residual = (residual - residual.mean((2, 3), keepdim=True)) / misfit.variance.sqrt()
-    power = float(residual.square().mean())
-    if power == 0:
-        return 0.0
-    beside = [(residual * torch.roll(residual, 1, axis)).mean() for axis in (2, 3)]
-    return float(torch.stack(beside).mean()) / power
+    y, x = (torch.fft.fftfreq(n, device=residual.device).abs() for n in residual.shape[2:])
+    high = torch.maximum(y[:, None], x) > HIGH
+    power = torch.fft.fft2(residual).abs().square().mean((0, 1))
+    overall = float(power.mean())
+    return float(power[high].mean()) / overall if bool(high.any()) and overall > 0 else 1.0

@@ -20,7 +20,7 @@ _SURE = 5.0  # standard deviations: 1 in 2 million blocks of noise is beyond
 
 # Contrast at the border, relative to the greatest within. For beads and balls that come near the border a periodic
 # model of the field alone leaves 0.1 % of the variance at 0.1, and 1 % at 0.3.
-_SHARE = 0.15
+_SHARE = 0.3
 
 _MOST = 1 / 3  # of a side
 
@@ -32,7 +32,7 @@ def reaches_border(data: Float[np.ndarray, "prism focus y x"], noise: Sequence[f
     unit; None is measured in the images.
 
     The outermost two pixels are divided into blocks of 2 × 4 pixels. The specimen is at the border where a block's
-    median differs from that of its image by 5 standard deviations of the noise, and by 0.15 of the greatest difference
+    median differs from that of its image by 5 standard deviations of the noise, and by 0.3 of the greatest difference
     of any block of the prism's images: light that a specimen well inside scatters as far as the border is less.
     Raises ValueError for images of less than 8 × 8 pixels, or another number of noises than of prisms.
     """

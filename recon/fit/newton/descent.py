@@ -31,7 +31,7 @@ from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, with_values
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import WeightRecord, correlation
+from recon.prior.weight import WeightRecord, whiteness
 from torchdic import Fidelity
 from torchdic.errors import UnstableError
 
@@ -292,10 +292,10 @@ class _Descent:
         rule = self.problem.weight
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
-        rho = correlation(now.images, self.problem.misfit)
+        white = whiteness(now.images, self.problem.misfit)
         before = place.before if number != COARSE_STEPS else None
-        weight, reason = rule.next(place.weight, now.misfit, before, rho)
-        record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "correlation": rho, "reason": reason}
+        weight, reason = rule.next(place.weight, now.misfit, before, white)
+        record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "white": white, "reason": reason}
         return replace(place, weight=weight, records=(*place.records, record))
 
     def advanced(

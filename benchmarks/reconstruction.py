@@ -1,0 +1,269 @@
+"""How well the default recipe reconstructs scenes that it wasn't tuned on, what each of its parts buys, and by which
+method.
+
+    python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
+    python benchmarks/reconstruction.py ablation | nuisances | propagations | methods [--cache DIR]
+
+"error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
+misfit over what noise alone leaves, for a clean stack the misfit itself. Seconds are processor seconds of one thread.
+The noise is measured in the images, as `torchdic reconstruct` does.
+"""
+
+import argparse
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import scenes
+from recon.earlier.path_length import path_length
+from recon.earlier.tikhonov import tikhonov
+from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
+from recon.fit.newton import descent
+from recon.fit.problem import Problem, Recipe, measured_noise
+from recon.fit.setup import Setup, empty_medium
+from recon.fit.step import Step
+from recon.recording.cut_field import needed_margin
+from recon.report.metrics import volume_error
+from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
+from scenes import Scene
+from torchdic import Acquisition, Fidelity, Prism
+from torchdic.errors import SamplingWarning, WrapAroundWarning
+
+# Scenes on which parts of the recipe are left out.
+SOME = ("two beads", "cell", "bead", "fibres", "cell, 400 photons", "cell, 40000 photons", "cell, Δn × 3")
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a fit of a scene came to."""
+
+    scene: Scene
+    problem: Problem
+    last: Step
+    delta: Tensor
+    seconds: float
+
+    @property
+    def error(self) -> float:
+        """Relative L2 error of Δn."""
+        return volume_error(self.delta, self.scene.truth)
+
+    @property
+    def misfit(self) -> float:
+        """The final misfit, over the noise's where there is noise."""
+        return self.last.misfit / (self.scene.noise_misfit or 1.0)
+
+    @property
+    def mass(self) -> float:
+        """Sum of Δn over the true one."""
+        return float(self.delta.sum() / self.scene.truth.sum())
+
+
+def setup_of(scene: Scene) -> Setup:
+    """The empty volume before the scene's microscope, wider than the field where the specimen is."""
+    grid, data = scene.grid, scene.data
+    margin = needed_margin(data.numpy(), measured_noise(data), grid, scene.microscope, scene.background)
+    medium = empty_medium(grid.widened(margin, margin), scene.background, data)
+    return Setup(medium, scene.microscope, scene.acquisition, margin=margin)
+
+
+def fit(
+    scene: Scene, recipe: Recipe | None = None, fidelity: Fidelity | None = None, setup: Setup | None = None
+) -> Found:
+    """Fit a scene by a recipe; None is the default one, at the recommended fidelity."""
+    recipe = replace(recipe or Recipe(), bounds=Bounds(*scene.bounds))
+    usual = RECOMMENDED if recipe.method == "newton" else RECOMMENDED_FOR_ADAM
+    began = time.process_time()
+    problem = Problem.from_recipe(scene.data, setup or setup_of(scene), fidelity or usual, recipe)
+    last = None
+    for step in minimise(problem):
+        last = step
+    assert last is not None
+    margin = problem.setup.margin
+    delta = last.delta[:, margin:-margin, margin:-margin] if margin else last.delta
+    return Found(scene, problem, last, delta, time.process_time() - began)
+
+
+def row(name: str, found: Found) -> str:
+    """A fit's line of a table."""
+    weight = f"{found.last.weights[-1]['tv']:.0f}" if found.last.weights else "–"
+    cells = (
+        name,
+        f"{found.scene.noise_misfit:.3g}",
+        f"{found.error:.3f}",
+        f"{found.mass:.2f}",
+        f"{found.misfit:.3f}" if found.scene.photons else f"({found.misfit:.4f})",
+        weight,
+        str(found.last.number),
+        f"{found.seconds:.1f}",
+    )
+    return "| " + " | ".join(cells) + " |"
+
+
+HEAD = "| scene | noise | error | mass | misfit/noise | tv | steps | s |\n|---|---|---|---|---|---|---|---|"
+
+
+def all_scenes(options: argparse.Namespace) -> None:
+    """The default recipe on every scene, and on drawn ones."""
+    print(HEAD)
+    names = options.names or list(scenes.SETUPS)
+    chosen = [scenes.scene(name, options.cache) for name in names]
+    chosen += [scenes.drawn(seed, options.cache) for seed in range(options.drawn)]
+    errors = []
+    for scene in chosen:
+        found = fit(scene, Recipe(method=options.method))
+        errors.append(math.log(found.error))
+        print(row(f"{scene.name} ({scene.kind})" if "drawn" in scene.name else scene.name, found), flush=True)
+    print(f"\ngeometric mean of the errors: {math.exp(sum(errors) / len(errors)):.4f}")
+
+
+def ablation(options: argparse.Namespace) -> None:
+    """The default recipe without one of its parts, on SOME scenes: errors."""
+    usual = Recipe()
+    plain = replace(RECOMMENDED, sources=32, padding=0)
+    ways: Sequence[tuple[str, Recipe, Fidelity | None]] = (
+        ("default", usual, None),
+        ("plain total variation", replace(usual, prior="tv"), None),
+        ("smooth prior", replace(usual, prior="smooth"), None),
+        ("no term in |Δn|", replace(usual, l1=0.0), None),
+        ("tv 60 → 5 in place of the noise's", replace(usual, tv=(60.0, 5.0)), None),
+        ("no correction: 32 directions", usual, plain),
+        ("all directions in every step", replace(usual, draft_sources=None), None),
+        ("10 steps", replace(usual, steps=10), None),
+        ("40 steps", replace(usual, steps=40), None),
+        ("Adam, 150 steps", replace(usual, method="adam"), None),
+    )
+    table("without", ways, options)
+    with without_secants():
+        table("without secants", (("the weak Hessian alone", usual, None),), options, head=False)
+
+
+def without_secants() -> "Memory":
+    """Newton's steps by the weak Hessian alone."""
+    return Memory(0)
+
+
+class Memory:
+    """A number of secants within a block."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __enter__(self) -> None:
+        self.usual, descent.MEMORY = descent.MEMORY, self.number
+
+    def __exit__(self, *_: object) -> None:
+        descent.MEMORY = self.usual
+
+
+def table(
+    title: str, ways: Sequence[tuple[str, Recipe, Fidelity | None]], options: argparse.Namespace, *, head: bool = True
+) -> None:
+    """A row of errors (and processor seconds) for each way, a column for each of SOME scenes."""
+    if head:
+        print(f"| {title} | " + " | ".join(SOME) + " |\n" + "|---" * (len(SOME) + 1) + "|")
+    for name, recipe, fidelity in ways:
+        found = [fit(scenes.scene(scene, options.cache), recipe, fidelity) for scene in SOME]
+        print(f"| {name} | " + " | ".join(f"{f.error:.3f} ({f.seconds:.0f} s)" for f in found) + " |", flush=True)
+
+
+def nuisances(options: argparse.Namespace) -> None:
+    """The cell with a bias 10° off, brightness ±2 % and drift of 0.1 µm: ignored, learned, and known."""
+    scene = scenes.scene("cell", options.cache)
+    wrong = math.radians(10)
+    prisms = [Prism(p.shear, p.bias + math.copysign(wrong, float(p.bias))) for p in scene.acquisition.prisms if p]
+    random = torch.Generator().manual_seed(3)
+    shape = scene.data.shape[:2]
+    drift = 0.1 * torch.randn(*shape, 2, generator=random)
+    brightness = 1 + 0.02 * torch.randn(shape, generator=random)
+    spoiled = replace(setup_of(scene), brightness=brightness, drift=drift - drift.mean((0, 1))).recorded(scene.data)
+    declared = replace(scene, data=spoiled, acquisition=Acquisition(prisms, scene.acquisition.focus))
+    print(HEAD)
+    print(row("known and cleaned", fit(scene)), flush=True)
+    for name, learn in (
+        ("only brightness learned", ()),
+        ("and bias", ("bias",)),
+        ("and drift", ("drift",)),
+        ("and bias and drift", ("bias", "drift")),
+    ):
+        found = fit(declared, Recipe(learn=learn))
+        print(row(name, found), flush=True)
+        if "bias" in found.last.values:
+            off = [abs(float(b)) - math.pi / 2 for b in found.last.values["bias"]]
+            print(f"  |bias| off by {', '.join(f'{math.degrees(o):+.2f}°' for o in off)}")
+
+
+def propagations(options: argparse.Namespace) -> None:
+    """Rays and projection alone, by both methods."""
+    print(HEAD)
+    for name in ("bead, clean", "smooth ball"):
+        scene = scenes.scene(name, options.cache)
+        for fidelity in (Fidelity("projection"), Fidelity("rays", sources=16, steps=10), RECOMMENDED):
+            for method in ("newton", "adam"):
+                if (fidelity.propagation, method) == ("wave", "adam"):
+                    continue
+                found = fit(scene, Recipe(method=method, steps=40 if method == "adam" else None), fidelity)
+                inside = scene.truth > 0.9 * scene.truth.max()
+                centre = float(found.delta[inside].mean() / scene.truth[inside].mean())
+                print(row(f"{name}, {fidelity.propagation}, {method}, centre {centre:.2f}", found), flush=True)
+
+
+def methods(options: argparse.Namespace) -> None:
+    """All methods on SOME scenes: errors."""
+    print("| method | " + " | ".join(SOME) + " |\n" + "|---" * (len(SOME) + 1) + "|")
+    for name, solve in (("newton", _newton), ("linear", _linear), ("opl", _opl)):
+        print(f"| {name} | " + " | ".join(solve(scenes.scene(s, options.cache)) for s in SOME) + " |", flush=True)
+
+
+def _newton(scene: Scene) -> str:
+    found = fit(scene)
+    return f"{found.error:.3f} ({found.seconds:.1f} s)"
+
+
+def _linear(scene: Scene) -> str:
+    began = time.process_time()
+    found = tikhonov(scene.data, setup_of(scene), measured_noise(scene.data), Bounds(*scene.bounds))
+    return f"{volume_error(found.delta, scene.truth):.3f} ({time.process_time() - began:.1f} s)"
+
+
+def _opl(scene: Scene) -> str:
+    began = time.process_time()
+    found = path_length(scene.data, setup_of(scene), measured_noise(scene.data))
+    return f"{volume_error(found.delta, scene.truth):.3f} ({time.process_time() - began:.1f} s)"
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "scenes": all_scenes,
+    "ablation": ablation,
+    "nuisances": nuisances,
+    "propagations": propagations,
+    "methods": methods,
+}
+
+
+def main() -> int:
+    """Print the chosen table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=COMMANDS)
+    parser.add_argument("names", nargs="*", help="scenes; all without any")
+    parser.add_argument("--drawn", type=int, default=0, help="number of drawn scenes")
+    parser.add_argument("--method", choices=("newton", "adam"), default="newton")
+    parser.add_argument("--cache", type=Path, default=None, help="folder of the scenes' noiseless images")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    for category in (SamplingWarning, WrapAroundWarning):
+        warnings.simplefilter("ignore", category)
+    COMMANDS[options.what](options)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
