@@ -76,7 +76,13 @@ def _move(
     misfit = problem.misfit(images)
     weights = past[1]
     if problem.weight is not None and step % BETWEEN_WEIGHTS == 0:
-        weights = _followed(problem, problem.weight, step, float(misfit.detach()), (weights, images.detach()))
+        weights = _followed(
+            problem,
+            problem.weight,
+            step,
+            float(misfit.detach()),
+            (weights, images.detach(), setup.volume.delta.detach()),
+        )
     found = contrast(setup.volume.delta.detach()) if step >= UNTIL_CONTRAST * problem.steps else 0.0
     priors = [prior.at_contrast(found) for prior in problem.priors]
     loss = misfit
@@ -103,17 +109,18 @@ def _followed(
     rule: FollowsNoise,
     step: int,
     misfit: float,
-    past: tuple[tuple[WeightRecord, ...], Tensor],
+    past: tuple[tuple[WeightRecord, ...], Tensor, Tensor],
 ) -> tuple[WeightRecord, ...]:
-    """The weights so far and the one for the next steps. past: the weights before, and the current images."""
-    weights, images = past
+    """The weights so far and the one for the next steps. past: the weights before, and the current images and Δn."""
+    weights, images, delta = past
     before = weights[-1]["misfit"]
     if math.isnan(before) and step < UNTIL_CONTRAST * problem.steps:
         if step == 0:
             return weights
         before = math.inf
     white = whiteness(images, problem.misfit)
-    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, white)
+    found = max(contrast(delta), 1e-9)
+    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, white, EDGE * found)
     return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "white": white, "reason": reason})
 
 

@@ -8,6 +8,7 @@ The residual tells it: what the specimen scatters lies at low frequencies, noise
 residual's high frequencies are as strong as all, it is white, and no more of the specimen is left in it.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,11 +28,16 @@ GAIN, TWICE = 15.0, 2.0
 FALLING = 0.03
 
 # Frequencies above this many cycles per pixel, along y or x, are high.
-HIGH = 0.25
+HIGH = 0.35
 
 # The residual's noise is believed within these factors of the noise that was measured in the images: below lies what is
 # smooth from pixel to pixel, above what the model can't show.
 LEAST, MOST = 0.93, 1.2
+
+# Weight times the width of an edge that is usual. The noise of finite images is known to within its standard error.
+# Within UNSURE of these, where weights a factor of FAR apart lead to all but the same misfit, the usual weight is
+# preferred.
+USUAL, UNSURE, FAR = 0.8, 1.0, math.e
 
 # What the weight was at a step, the misfit and the residual's correlation there, and why it was changed, or not.
 WeightRecord = dict[str, Any]
@@ -42,26 +48,32 @@ class FollowsNoise:
     """The common weight of the priors as a descent goes on.
 
     noise_misfit: what noise alone leaves of the misfit, as it was measured in the images; None where it wasn't: then
-    the residual alone tells it. first: the weight at first; None is chosen by the specimen's contrast.
+    the residual alone tells it. pixels: of all images, that count. first: the weight at first; None is chosen by the
+    specimen's contrast.
     """
 
     noise_misfit: float | None
+    pixels: int
     first: float | None = None
 
-    def aim(self, misfit: float, white: float) -> float:
-        """The misfit that is aimed at. misfit, white: of the current volume, see `whiteness`."""
+    def aim(self, misfit: float, white: float, usual: float) -> float:
+        """The misfit that is aimed at.
+
+        misfit, white: of the current volume, see `whiteness`. usual: the weight over the usual one.
+        """
         noise = misfit * white
         if self.noise_misfit is not None:
             noise = min(max(noise, LEAST * self.noise_misfit), MOST * self.noise_misfit)
-        return noise + MODEL * max(0.0, 1 - noise)
+        unsure = UNSURE * math.sqrt(2 / self.pixels) * min(max(math.log(usual) / math.log(FAR), -1.0), 1.0)
+        return noise * (1 - unsure) + MODEL * max(0.0, 1 - noise)
 
-    def next(self, weight: float, misfit: float, before: float | None, white: float) -> tuple[float, str]:
+    def next(self, weight: float, misfit: float, before: float | None, white: float, width: float) -> tuple[float, str]:
         """The next weight, and the reason.
 
         misfit: of the current volume. before: the misfit one accepted step earlier; None at first. white: `whiteness`
-        of the current residual.
+        of the current residual. width: of an edge, in Δn.
         """
-        aim = self.aim(misfit, white)
+        aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"
         factor = min(max((aim / misfit) ** GAIN, 1 / TWICE), TWICE)

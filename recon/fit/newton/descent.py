@@ -48,7 +48,7 @@ UNTIL_CONTRAST, UNTIL_WEIGHT = 3, 2
 WIDE, NARROWER = 1.0 / EDGE, 0.7
 
 # Steps with the fewest directions.
-COARSE_STEPS = 7
+COARSE_STEPS = 4
 
 # ADMM's penalty on differences, over the weight: 1/(this share of the width of an edge).
 PENALTY = 0.4
@@ -57,7 +57,7 @@ PENALTY = 0.4
 TIKHONOV = 0.03
 
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
-STILL, STEADY = 1e-4, 0.01
+STILL, STEADY = 2e-5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +294,7 @@ class _Descent:
             return place
         white = whiteness(now.images, self.problem.misfit)
         before = place.before if number != COARSE_STEPS else None
-        weight, reason = rule.next(place.weight, now.misfit, before, white)
+        weight, reason = rule.next(place.weight, now.misfit, before, white, EDGE * place.scale)
         record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "white": white, "reason": reason}
         return replace(place, weight=weight, records=(*place.records, record))
 
