@@ -339,7 +339,7 @@ def test_newton_ends_by_itself_and_does_not_go_on_afterwards(truth):
 @pytest.mark.parametrize(("one", "other"), [(NEWTON, ADAM), (ADAM, NEWTON)], ids=["adam's", "newton's"])
 def test_a_step_of_another_method_is_refused(truth, one, other):
     step = run(seen(truth), dataclasses.replace(other, steps=1))[-1]
-    with pytest.raises(ValueError, match="the saved step (is none of Newton's method|has the unknowns)"):
+    with pytest.raises(ValueError, match=r"the saved step (is none of Newton's method|has the unknowns)"):
         run(seen(truth), one, resume=step)
 
 

@@ -378,7 +378,7 @@ class _Descent:
         actual = formed.value - now.misfit + penalties
         share = actual / predicted if predicted < 0 else (0.5 if actual < 0 else -1.0)
         objective = now.misfit + self.penalty(place, place.delta, number)
-        still = place.still + 1 if -actual < STILL * objective and self.steady(place) else 0
+        still = place.still + 1 if -actual < STILL * objective and self.steady(place, number) else 0
         if share < BAD and -predicted < STILL * objective:
             # the place is the minimum with these weights: it counts as reached, so that the weights go on
             onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.misfit)
@@ -418,10 +418,13 @@ class _Descent:
         """Whether further steps would change nothing; the first careful one is always taken."""
         return number > COARSE_STEPS and (place.still >= 2 or place.damping > MOST)
 
-    def steady(self, place: Place) -> bool:
-        """Whether the weight has all but stopped moving."""
+    def steady(self, place: Place, number: int) -> bool:
+        """Whether the priors' weights have all but stopped moving."""
+        if self.problem.weight is None:
+            now, last = (self.priors(place, step) for step in (number, self.problem.steps - 1))
+            return [weight for weight, _ in now] == [weight for weight, _ in last]
         if len(place.records) < 2:
-            return self.problem.weight is None
+            return False
         last, previous = place.records[-1]["tv"], place.records[-2]["tv"]
         return abs(math.log(last / previous)) < STEADY
 
