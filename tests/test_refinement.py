@@ -280,17 +280,17 @@ def test_a_step_that_would_raise_the_misfit_is_not_taken(monkeypatch):
         step, length = right(*arguments)
         return {name: -part for name, part in step.items()}, length
 
-    monkeypatch.setattr(scalars, "_gauss_newton", backwards)
+    monkeypatch.setattr(refinement, "_gauss_newton", backwards)
     assert torch.equal(refined(unknowns, start, known, misfit, FIDELITY)["brightness"], start["brightness"])
 
     def long(*arguments):
         step, length = right(*arguments)
         return {name: 3 * part for name, part in step.items()}, length
 
-    monkeypatch.setattr(scalars, "STEPS", 1)
-    monkeypatch.setattr(scalars, "_gauss_newton", long)
+    monkeypatch.setattr(refinement, "STEPS", 1)
+    monkeypatch.setattr(refinement, "_gauss_newton", long)
     half = refined(unknowns, start, known, misfit, FIDELITY)["brightness"]
-    monkeypatch.setattr(scalars, "_gauss_newton", right)
+    monkeypatch.setattr(refinement, "_gauss_newton", right)
     expected = 1.5 * refined(unknowns, start, known, misfit, FIDELITY)["brightness"]
     torch.testing.assert_close(half, expected, rtol=1e-4, atol=1e-7)
 
@@ -320,10 +320,10 @@ def test_what_is_found_on_nearby_images_is_judged_by_new_ones(monkeypatch):
 
         return lowered
 
-    monkeypatch.setattr(scalars, "STEPS", 1)
-    monkeypatch.setattr(scalars, "_lowered", further(-1.0))
+    monkeypatch.setattr(refinement, "STEPS", 1)
+    monkeypatch.setattr(refinement, "_lowered", further(-1.0))
     assert torch.equal(refined(unknowns, start, known, misfit, FIDELITY)["bias"], start["bias"])
-    monkeypatch.setattr(scalars, "_lowered", further(3.0))
+    monkeypatch.setattr(refinement, "_lowered", further(3.0))
     moved = refined(unknowns, start, known, misfit, FIDELITY)["bias"] - start["bias"]
     torch.testing.assert_close(moved, torch.full((2,), -0.15), rtol=0, atol=0.02)
 

@@ -20,7 +20,19 @@ from recon.report.metrics import volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint
 from recon.run.room import held_beside_images
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+from torchdic import (
+    Acquisition,
+    Condenser,
+    Fidelity,
+    Grid,
+    JonesPupil,
+    Microscope,
+    Objective,
+    Polarisation,
+    Prism,
+    Volume,
+    image,
+)
 
 BACKGROUND = 1.5
 GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
@@ -57,18 +69,25 @@ def data(truth):
         return image(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, FIDELITY)
 
 
-def problem(data, acquisition, *more, steps=40):
+def problem(data, acquisition, *more, steps=40, method="adam"):
     """Δn, and more unknowns beside it, sought behind the data with an acquisition that may be wrong."""
     setup = Setup(empty_medium(GRID, BACKGROUND, data), MICROSCOPE, acquisition)
-    recipe = Recipe(steps=steps, start="zero", tv=(20.0, 5.0), draft_sources=None)
+    recipe = Recipe(method, steps, start="zero", tv=(20.0, 5.0), prior="tv", draft_sources=None)
     made = Problem.from_recipe(data, setup, FIDELITY, recipe)
-    return replace(made, unknowns=[*made.unknowns, *more])
+    return replace(made, unknowns=[made.unknowns[0], *more])
+
+
+@pytest.fixture(params=["newton", "adam"])
+def method(request):
+    return request.param
 
 
 def same(a, b):
     """Bit for bit, dicts and tensors alike."""
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
 
 
@@ -107,15 +126,54 @@ def test_a_descent_of_two_unknowns_goes_on_from_disk_bit_for_bit(data, tmp_path)
         assert all(alike(a, b) for a, b in zip(rest, steps[step.number :], strict=True))
 
 
-def test_a_problem_can_be_solved_again(data):
-    two = problem(data, DECLARED, BiasOffset(0.05), steps=4)
+def test_a_problem_can_be_solved_again(data, method):
+    two = problem(data, DECLARED, Bias(), steps=4, method=method)
     assert all(alike(a, b) for a, b in zip(minimise(two), minimise(two), strict=True))
 
 
-def test_a_step_of_other_unknowns_is_refused_with_their_names(data):
-    step = next(minimise(problem(data, DECLARED)))
-    with pytest.raises(ValueError, match="the saved step has the unknowns delta, the descent has delta, bias offset"):
-        next(minimise(problem(data, DECLARED, BiasOffset(0.05)), step))
+def test_a_step_of_other_unknowns_is_refused_with_their_names(data, method):
+    step = next(minimise(problem(data, DECLARED, method=method)))
+    with pytest.raises(ValueError, match="the saved step has the unknowns delta, the descent has delta, bias"):
+        next(minimise(problem(data, DECLARED, Bias(), method=method), step))
+
+
+def test_newton_names_what_it_does_not_find(data):
+    with pytest.raises(ValueError, match="finds Δn and nuisances, not bias offset; use method 'adam'"):
+        next(minimise(problem(data, DECLARED, BiasOffset(0.05), method="newton")))
+    alone = replace(problem(data, DECLARED, method="newton"), unknowns=[Bias()])
+    with pytest.raises(ValueError, match="finds Δn, which is none of the unknowns; use method 'adam'"):
+        next(minimise(alone))
+
+
+@pytest.mark.parametrize(
+    ("microscope", "acquisition", "law"),
+    [
+        (MICROSCOPE, Acquisition([Prism((0.0, 0.24), 0.0), Prism((0.24, 0.0), 2 * math.pi)]), r"\(biases 0, 6.28319\)"),
+        (replace(MICROSCOPE, condenser_prism=False), TRUE, "asks for a condenser prism"),
+        (
+            replace(MICROSCOPE, polarisation=Polarisation(pupil=JonesPupil(retardance={4: (0.1, 0.0)}))),
+            TRUE,
+            "can't hold a polarisation pupil",
+        ),
+    ],
+    ids=["no bias", "no condenser prism", "pupil"],
+)
+def test_newton_names_the_linear_transfer_that_it_lacks(data, microscope, acquisition, law):
+    data = data[: len(acquisition.prisms), : len(acquisition.focus)]
+    setup = Setup(empty_medium(GRID, BACKGROUND, data), microscope, acquisition)
+    problem = Problem.from_recipe(data, setup, FIDELITY, Recipe())
+    with pytest.raises(ValueError, match=f"the linear transfer.*{law}.*; use method 'adam'"):
+        next(minimise(problem))
+
+
+def test_one_prism_without_bias_is_explained_beside_another(data, truth):
+    """An image without bias has no linear response; the others' Hessian serves it as well."""
+    acquisition = Acquisition([Prism((0.0, 0.24), 0.0), TRUE.prisms[1]], TRUE.focus)
+    with torch.no_grad():
+        data = image(Volume(GRID, truth, BACKGROUND), MICROSCOPE, acquisition, FIDELITY)
+    setup = Setup(empty_medium(GRID, BACKGROUND, data), MICROSCOPE, acquisition)
+    *_, last = minimise(Problem.from_recipe(data, setup, FIDELITY, Recipe()))
+    assert last.misfit < 0.1
 
 
 def test_two_unknowns_of_one_name_are_refused(data):
@@ -170,12 +228,12 @@ DRIFT = torch.tensor([[[0.1, -0.06], [-0.04, 0.1], [-0.08, 0.0]], [[0.06, 0.05],
 NUISANCES = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
 
 
-def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth):
+def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth, method):
     known = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, BRIGHTNESS, DRIFT)
     with torch.no_grad():
         data = known.images(FIDELITY)
-    *_, wrong = minimise(problem(data, DECLARED))
-    *_, learned = minimise(problem(data, DECLARED, Bias(), Brightness(), Drift(), steps=80))
+    *_, wrong = minimise(problem(data, DECLARED, method=method))
+    *_, learned = minimise(problem(data, DECLARED, Bias(), Brightness(), Drift(), steps=80, method=method))
     assert learned.misfit < 0.2 * wrong.misfit
     assert volume_error(learned.delta, truth) < 0.5 * volume_error(wrong.delta, truth)
     assert float((learned.values["bias"] - torch.tensor([1.5, -1.2])).abs().max()) < 0.25 * OFF
@@ -183,11 +241,11 @@ def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth):
     assert learned.values["brightness"].shape == (2, 3)
 
 
-def test_a_descent_of_everything_goes_on_from_disk_bit_for_bit(data, tmp_path):
-    everything = problem(data, DECLARED, *NUISANCES, steps=6)
+def test_a_descent_of_everything_goes_on_from_disk_bit_for_bit(data, tmp_path, method):
+    everything = problem(data, DECLARED, *NUISANCES, steps=11 if method == "newton" else 6, method=method)
     steps = list(minimise(everything))
     assert set(steps[-1].values) == {"delta", "bias", "brightness", "drift", "focus", "shear"}
-    for step in steps[0], steps[3]:
+    for step in steps[0], steps[3], *steps[6:-1]:
         checkpoint.save(tmp_path / "checkpoint.pt", Checkpoint(step, [], ""))
         again = checkpoint.load(tmp_path / "checkpoint.pt", "").step
         assert alike(again, step)
@@ -205,13 +263,14 @@ def test_adams_first_step_is_as_long_as_the_nuisances_rate(unknown, data, truth)
     assert float(moved.max()) == pytest.approx(unknown.learning_rate, rel=1e-3)
 
 
-def test_a_volume_with_a_margin_descends(truth):
+def test_a_volume_with_a_margin_descends(truth, method):
     """Data of the middle of the true volume; the wide one explains them, beside a drift."""
     wide = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, drift=DRIFT, margin=2)
     with torch.no_grad():
         data = wide.images(FIDELITY)
     setup = replace(wide, volume=empty_medium(GRID, BACKGROUND, data), drift=None)
-    recipe = Recipe(steps=40, start="linear", tv=(20.0, 5.0), draft_sources=None)
+    given = {"tv": (20.0, 5.0), "prior": "tv"} if method == "adam" else {}
+    recipe = Recipe(method, 40, start="linear", draft_sources=None, **given)
     made = Problem.from_recipe(data, setup, FIDELITY, recipe)
     *_, last = minimise(replace(made, unknowns=[*made.unknowns, Drift()]))
     assert last.delta.shape == GRID.shape
@@ -232,8 +291,8 @@ def test_room_is_found_for_what_drift_and_brightness_hold(data):
     assert held["bias"] == pytest.approx(without, abs=4096)
 
 
-def test_room_is_found_for_a_problem_with_a_margin(data):
-    made = problem(data, TRUE)
+def test_room_is_found_for_a_problem_with_a_margin(data, method):
+    made = problem(data, TRUE, method=method)
     setup = replace(made.setup, volume=empty_medium(GRID.widened(3, 3), BACKGROUND, data), margin=3)
     wide = held_beside_images(replace(made, setup=setup), GaussianMisfit, FIDELITY)
     assert wide > held_beside_images(made, GaussianMisfit, FIDELITY)

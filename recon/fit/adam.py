@@ -10,7 +10,7 @@ from torch import Tensor
 
 from recon.fit.planned import PlanRecord
 from recon.fit.problem import Problem
-from recon.fit.step import Step
+from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
@@ -54,7 +54,7 @@ def minimise_by_adam(problem: Problem, resume: Step | None = None) -> Iterator[S
         plans, weights = taken.plans, taken.weights
         values = unknowns.values()
         delta = values.get(IndexDifference.name, problem.setup.volume.delta)
-        _check_convergence(step + 1, taken.loss, values, float(problem.setup.volume.background) + float(delta.min()))
+        check_convergence(step + 1, taken.loss, values, float(problem.setup.volume.background) + float(delta.min()))
         passed, state = seconds + time.perf_counter() - started, unknowns.state(adam)
         yield Step(step + 1, taken.misfit, taken.loss, delta, passed, values, state, plans, weights)
 
@@ -122,11 +122,3 @@ def _followed(
     found = max(contrast(delta), 1e-9)
     weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, white, EDGE * found)
     return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "white": white, "reason": reason})
-
-
-def _check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:
-    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive."""
-    if not math.isfinite(loss) or not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}")
-    if lowest <= 0:
-        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}")

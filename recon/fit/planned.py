@@ -27,8 +27,8 @@ PlanRecord = dict[str, Any]
 class GivenFidelity:
     """One fidelity for all steps, at first with fewer condenser directions.
 
-    fidelity: of the images. draft_sources: condenser directions of the first 60 % of the steps, where the fidelity asks
-    for more; None is the fidelity's from the first step on.
+    fidelity: of the images. draft_sources: condenser directions of the first 60 % of Adam's steps, and of Newton's,
+    where the fidelity asks for more; None is the fidelity's from the first step on.
     """
 
     fidelity: Fidelity
@@ -37,10 +37,16 @@ class GivenFidelity:
     def at(
         self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
     ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
-        """The fidelity of a step, counted from 0, and the plans so far, which stay as they are."""
+        """The fidelity of a step of Adam's, counted from 0, and the plans so far, which stay as they are."""
         draft = self.draft_sources is not None and self.draft_sources < self.fidelity.sources
         if draft and step < DRAFT * steps:
             return replace(self.fidelity, sources=self.draft_sources), plans
+        return self.careful(step, setup, plans)
+
+    def careful(
+        self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]
+    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+        """The fidelity without drafts at a step, counted from 0, and the plans so far, which stay as they are."""
         return self.fidelity, plans
 
     def last(self, plans: tuple[PlanRecord, ...]) -> Fidelity:
@@ -62,7 +68,13 @@ class PlannedFidelity:
     def at(
         self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
     ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
-        """The fidelity of a step, counted from 0, and the plans so far with the one made for it."""
+        """The fidelity of a step of Adam's, counted from 0, and the plans so far with the one made for it."""
+        return self.careful(step, setup, plans)
+
+    def careful(
+        self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]
+    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+        """The fidelity without drafts at a step, counted from 0, and the plans so far with the one made for it."""
         plans = follow(plans, step, setup, self.tolerance)
         return current(plans), plans
 

@@ -1,7 +1,9 @@
 """One step of a descent, by whatever method."""
 
+import math
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -37,3 +39,11 @@ class Step:
     def row(self) -> Row:
         """The step's row of the log."""
         return self.number, self.misfit, self.loss, self.seconds
+
+
+def check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:
+    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive."""
+    if not math.isfinite(loss) or not all(bool(torch.isfinite(value).all()) for value in values.values()):
+        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}")
+    if lowest <= 0:
+        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}")

@@ -10,7 +10,6 @@ explains the data by careful images (the defect correction of K. Böhmer, P. Hem
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -59,10 +58,6 @@ class Correction:
         added = setup.formed(careful) - formed.detach()
         moved = size(added if self.added is None else added - self.added)
         return Correction(added, REST if moved < SETTLED else 0)
-
-    def state(self) -> dict[str, Any]:
-        """Its values, for a checkpoint."""
-        return {"added": self.added, "rest": self.rest}
 
 
 def drafts(careful: Fidelity, sources: int | None) -> tuple[Fidelity, Fidelity]:

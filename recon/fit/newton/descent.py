@@ -21,23 +21,26 @@ from torch import Tensor
 from recon.fit.newton.correction import Correction, drafts
 from recon.fit.newton.proximal import Penalties, Split, minimised
 from recon.fit.newton.secants import MEMORY, Pair, Secants
-from recon.fit.newton.weak_hessian import WeakHessian
+from recon.fit.newton.weak_hessian import WeakHessian, check_linear_response
 from recon.fit.nuisances.base import Nuisance
 from recon.fit.nuisances.refinement import refined
 from recon.fit.planned import PlanRecord
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
-from recon.fit.step import Step
+from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, with_values
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
 from recon.prior.weight import WeightRecord, whiteness
 from torchdic import Fidelity
 from torchdic.errors import UnstableError
+from torchdic.scalar import number as number_of
 
 # λ over the Hessian's mean: at first, the least, and the factors by which the ratio of actual to predicted decrease
 # moves it (ratios above GOOD, below POOR, and below BAD, where the step is taken back).
 FIRST, LEAST = 0.3, 3e-3
+# Above it no step is long enough to change anything, and the descent ends.
+MOST = 1e6
 GOOD, POOR, BAD = 0.7, 0.3, 0.05
 SHORTER, LONGER, BACK = 2.0, 0.4, 4.0
 
@@ -56,8 +59,22 @@ PENALTY = 0.4
 # Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
 TIKHONOV = 0.03
 
+# Share of the data's variance that counts like a residual in the mean of an image's curvature: there may be none.
+EVEN = 1e-6
+
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 2e-5, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """What a Hessian is made for. A resumed descent makes the same one again.
+
+    parameters: of the nuisances, by name. curvature: of the misfit, by each pixel of an image (prism, focus).
+    """
+
+    parameters: dict[str, Tensor]
+    curvature: Float[Tensor, "prism focus"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +82,11 @@ class Place:
     """Where a descent stands: all that is needed to go on, besides what the problem says.
 
     delta: Δn (z, y, x). parameters: of the nuisances, by name. split: of the last model. correction: of the draft
-    images.
-    damping: λ over the Hessian's mean. weight: of the priors. contrast: of the specimen, times the width of edges over
-    the last one; 0 while the priors don't know it. scale: the same, known from the first step on. accepted: number of
-    steps that were. before: the misfit one accepted step earlier. moved: whether the last step was accepted. still:
-    accepted steps in a row that changed next to nothing. pairs: for the secants. records: of the weight.
+    images. weight: of the priors. scale: the specimen's contrast, times the width of edges over the last one.
+    around: what the Hessian was made for. damping: λ over the Hessian's mean. contrast: as scale, but 0 while the
+    priors don't know it. accepted: number of steps that were. before: the misfit one accepted step earlier.
+    moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
+    pairs: for the secants. records: of the weight.
     """
 
     delta: Float[Tensor, "z y x"]
@@ -78,6 +95,7 @@ class Place:
     correction: Correction
     weight: float
     scale: float
+    around: Around
     damping: float = FIRST
     contrast: float = 0.0
     width: float = WIDE
@@ -109,11 +127,11 @@ class Formed:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A volume's misfit, its gradient (z, y, x), and the recorded images of the model."""
+    """A volume's misfit, its gradient, and the recorded images of the model."""
 
     misfit: float
     gradient: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus y x"]
+    images: Float[Tensor, "prism focus row column"]
 
 
 def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
@@ -121,8 +139,9 @@ def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator
 
     It ends after the problem's steps, or where nothing changes any more. The unknowns are Δn and any nuisances.
     resume: the step to go on from; the rest is as if there had been no interruption.
-    Raises ValueError where an unknown is neither Δn nor a nuisance or the step is of another descent, and
-    NotImplementedError for a prior without a majorant.
+    Raises ValueError where Δn isn't among the unknowns, another unknown is no nuisance, no image shows a weak specimen
+    to first order, or the step is of another descent; NotImplementedError for a prior without a majorant; and
+    FloatingPointError where the first volume has no images.
     """
     yield from _Descent(problem).steps(resume)
 
@@ -130,11 +149,15 @@ def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator
 class _Descent:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        (self.index,) = (u for u in problem.unknowns if isinstance(u, IndexDifference))
+        found = [u for u in problem.unknowns if isinstance(u, IndexDifference)]
+        if not found:
+            raise ValueError("Newton's method finds Δn, which is none of the unknowns; use method 'adam'")
+        self.index = found[0]
         self.nuisances = [u for u in problem.unknowns if isinstance(u, Nuisance)]
         others = [u.name for u in problem.unknowns if u is not self.index and u not in self.nuisances]
         if others:
-            raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}: fit with method 'adam'")
+            raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}; use method 'adam'")
+        check_linear_response(problem.setup.microscope, problem.setup.acquisition)
         self.bounds = self.index.bounds
         grid = problem.setup.volume.grid
         self.ratio = grid.spacing[2] / grid.spacing[0]
@@ -145,41 +168,44 @@ class _Descent:
         started, problem = time.perf_counter(), self.problem
         place, first, seconds = None, 0, 0.0
         if resume is not None:
-            place = _restored(resume.state, problem.misfit.data.device)
+            names = [unknown.name for unknown in problem.unknowns]
+            place = _restored(resume.state, names, problem.misfit.data.device)
             first, seconds, self.plans = resume.number, resume.seconds, resume.plans
-        careful = draft = hessian = now = None
+        hessian = now = None
         for number in range(first, problem.steps):
-            setup = self.placed(place)
-            careful, self.plans = problem.fidelity.at(number, problem.steps, setup, self.plans)
-            coarse, fine = drafts(careful, problem.fidelity.draft_sources)
-            wanted = coarse if number < COARSE_STEPS else fine
-            if wanted != draft:
-                draft = wanted
-                hessian = self.hessian(setup, draft)
-                if place is None:
-                    place = self.start(hessian, draft)
-                elif number == COARSE_STEPS:
-                    place = replace(place, pairs=(), correction=Correction())
-                now = None
-            assert place is not None
-            assert hessian is not None
-            assert draft is not None
-            exact = careful if number >= COARSE_STEPS and careful != draft else None
-            if now is None:
-                formed = self.formed(place, draft)
-                if number == COARSE_STEPS:
-                    now, place = self.renewed(place, formed, draft, exact)
-                else:
-                    now = self.judged(place, formed)
-            place = self.weighted(place, now, number)
-            loss = now.misfit + self.penalty(place, place.delta, number)
-            misfit = now.misfit
-            place, now = self.advanced(place, now, hessian, (draft, exact), number)
-            taken = seconds + time.perf_counter() - started
-            values = self.values(place)
-            yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
-            if place.still >= 2 and number >= COARSE_STEPS:
+            if place is not None and self.ended(place, number):
                 return
+            draft, exact, turns = self.drafted(place, number)
+            try:
+                if place is None:
+                    place, hessian, now = self.start(draft, exact)
+                elif turns:
+                    place, hessian, now = self.turned(place, draft, exact)
+                elif hessian is None or now is None:
+                    hessian, now = self.hessian(place.around, draft), self.judged(place, self.formed(place, draft))
+            except UnstableError as error:
+                raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
+            place = self.weighted(place, now, number)
+            misfit, loss = now.misfit, now.misfit + self.penalty(place, place.delta, number)
+            check_convergence(number + 1, loss, self.values(place), self.lowest(place.delta))
+            place, now = self.advanced(place, now, hessian, (draft, exact), number)
+            taken, values = seconds + time.perf_counter() - started, self.values(place)
+            yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
+
+    def drafted(self, place: Place | None, number: int) -> tuple[Fidelity, Fidelity | None, bool]:
+        """The fidelity of a step's images, the careful one to which they are corrected, if any, and whether they turn.
+
+        They turn where a step's images are computed otherwise than those of the step before.
+        """
+
+        def of(step: int, careful: Fidelity) -> tuple[Fidelity, Fidelity | None]:
+            coarse, fine = drafts(careful, self.problem.fidelity.draft_sources)
+            return (coarse, None) if step < COARSE_STEPS else (fine, careful if careful != fine else None)
+
+        before = None if place is None else of(number - 1, self.problem.fidelity.last(self.plans))
+        careful, self.plans = self.problem.fidelity.careful(number, self.placed(place), self.plans)
+        draft, exact = of(number, careful)
+        return draft, exact, before is not None and before != (draft, exact)
 
     # --- what the model says of a place -------------------------------------------------------------------------------
 
@@ -243,11 +269,26 @@ class _Descent:
         noise = self.problem.weight.noise_misfit if self.problem.weight is not None else None
         return share / max(noise or 0.0, 1e-3)
 
-    def hessian(self, setup: Setup, draft: Fidelity) -> WeakHessian:
-        """The weak specimen's Hessian, with the misfit's curvature at its data, for the directions of a draft."""
+    def lowest(self, delta: Float[Tensor, "z y x"]) -> float:
+        """The least index of a volume."""
+        return number_of(self.problem.setup.volume.background) + float(delta.min())
+
+    def around(self, parameters: dict[str, Tensor], images: Float[Tensor, "prism focus row column"]) -> Around:
+        """What a Hessian is made for, where the model's recorded images are these.
+
+        Of an image's pixels the curvature counts with the square of the residual: that is what steps are to explain.
+        """
         misfit = self.problem.misfit
-        curvature = misfit.curvature(misfit.data).expand(misfit.data.shape).mean((2, 3))
-        return WeakHessian(setup, self.voxels * curvature, draft, draft.memory // 2)
+        squares = misfit.where_counted((images - misfit.data).square() + EVEN * misfit.variance)
+        counted = misfit.where_counted(torch.ones_like(images)).mean((2, 3))
+        sums = squares.sum((2, 3)).clamp_min(torch.finfo(images.dtype).tiny)
+        return Around(parameters, counted * (misfit.curvature(images) * squares).sum((2, 3)) / sums)
+
+    def hessian(self, around: Around, draft: Fidelity) -> WeakHessian:
+        """The weak specimen's Hessian for the directions of a draft."""
+        values = {u.name: u.value(around.parameters[u.name]) for u in self.nuisances}
+        setup = with_values(self.nuisances, values, self.problem.setup)
+        return WeakHessian(setup, self.voxels * around.curvature, draft, draft.memory // 2)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""
@@ -267,20 +308,28 @@ class _Descent:
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
-    def start(self, hessian: WeakHessian, draft: Fidelity) -> Place:
+    def start(self, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
         """The empty volume, and the contrast and weight that a first linear estimate suggests."""
         problem = self.problem
-        delta = problem.misfit.data.new_zeros(problem.setup.volume.grid.shape)
-        delta = self.bounds.clamped(delta)
+        delta = self.bounds.clamped(problem.misfit.data.new_zeros(problem.setup.volume.grid.shape))
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
-        place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
-        now = self.judged(place, self.formed(place, draft))
+        none = self.around(parameters, problem.misfit.data)
+        place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0, around=none)
+        place, hessian, now = self.turned(place, draft, exact)
         inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
         linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
         scale = contrast(self.bounds.clamped(linear))
         scale = max(scale, contrast(linear) * 1e-3, 1e-9)
         first = None if problem.weight is None else problem.weight.first
-        return replace(place, scale=scale, weight=first if first is not None else 1 / (EDGE * scale))
+        weight = first if first is not None else 1 / (EDGE * scale)
+        return replace(place, scale=scale, weight=weight), hessian, now
+
+    def turned(self, place: Place, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
+        """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
+        place = replace(place, pairs=(), correction=Correction(), before=None)
+        now, place = self.renewed(place, self.formed(place, draft), draft, exact)
+        place = replace(place, around=self.around(place.parameters, now.images))
+        return place, self.hessian(place.around, draft), now
 
     def weighted(self, place: Place, now: Judged, number: int) -> Place:
         """The place with the priors' contrast and weight for the next step."""
@@ -293,8 +342,7 @@ class _Descent:
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
         white = whiteness(now.images, self.problem.misfit)
-        before = place.before if number != COARSE_STEPS else None
-        weight, reason = rule.next(place.weight, now.misfit, before, white, EDGE * place.scale)
+        weight, reason = rule.next(place.weight, now.misfit, place.before, white, EDGE * place.scale)
         record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "white": white, "reason": reason}
         return replace(place, weight=weight, records=(*place.records, record))
 
@@ -316,6 +364,9 @@ class _Descent:
         right = curved + damping * place.delta - self.voxels * now.gradient
         trial, split = minimised(solve, right, majorant, self.bounds, place.split, tie, self.ratio)
 
+        if not 0 < self.lowest(trial) < math.inf:  # a volume has no other index
+            return self.taken_back(place), now
+
         step = trial - place.delta
         penalties = self.penalty(place, trial, number) - self.penalty(place, place.delta, number)
         bent = float((step * (hessian(step) + secants(step))).sum()) / self.voxels
@@ -326,18 +377,23 @@ class _Descent:
             return self.taken_back(place), now
         actual = formed.value - now.misfit + penalties
         share = actual / predicted if predicted < 0 else (0.5 if actual < 0 else -1.0)
+        objective = now.misfit + self.penalty(place, place.delta, number)
+        still = place.still + 1 if -actual < STILL * objective and self.steady(place, number) else 0
+        if share < BAD and -predicted < STILL * objective:
+            # the place is the minimum with these weights: it counts as reached, so that the weights go on
+            onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.misfit)
+            return replace(onward, still=still), now
         if share < BAD:
             there = self.judged(onward, formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
         factor = LONGER if share > GOOD else SHORTER if share < POOR else 1.0
-        objective = now.misfit + self.penalty(place, place.delta, number)
         onward = replace(
             onward,
             damping=max(factor * place.damping, LEAST),
             accepted=place.accepted + 1,
             before=now.misfit,
             moved=True,
-            still=place.still + 1 if -actual < STILL * objective and self.steady(place) else 0,
+            still=still,
         )
         there, onward = self.renewed(onward, formed, *drafted)
         return replace(onward, pairs=self.remembered(place, now, there, step)), there
@@ -358,10 +414,17 @@ class _Descent:
         """The place before a step that failed, with more damping."""
         return replace(place, damping=BACK * place.damping, split=Split.at(place.delta), moved=False, still=0)
 
-    def steady(self, place: Place) -> bool:
-        """Whether the weight has all but stopped moving."""
+    def ended(self, place: Place, number: int) -> bool:
+        """Whether further steps would change nothing; the first careful one is always taken."""
+        return number > COARSE_STEPS and (place.still >= 2 or place.damping > MOST)
+
+    def steady(self, place: Place, number: int) -> bool:
+        """Whether the priors' weights have all but stopped moving."""
+        if self.problem.weight is None:
+            now, last = (self.priors(place, step) for step in (number, self.problem.steps - 1))
+            return [weight for weight, _ in now] == [weight for weight, _ in last]
         if len(place.records) < 2:
-            return self.problem.weight is None
+            return False
         last, previous = place.records[-1]["tv"], place.records[-2]["tv"]
         return abs(math.log(last / previous)) < STEADY
 
@@ -369,24 +432,34 @@ class _Descent:
 def _state(place: Place) -> dict[str, dict[str, Any]]:
     """A place as plain values and tensors, for a checkpoint."""
     numbers = {f.name: getattr(place, f.name) for f in fields(Place)}
-    for name in ("delta", "parameters", "split", "correction"):
+    for name in ("delta", "parameters"):
         del numbers[name]
+    numbers |= {"split": vars(place.split), "correction": vars(place.correction), "around": vars(place.around)}
     return {
         "delta": {"parameter": place.delta},
         **{name: {"parameter": parameter} for name, parameter in place.parameters.items()},
-        "newton": {**numbers, "split": vars(place.split), "correction": place.correction.state()},
+        "newton": numbers,
     }
 
 
-def _restored(state: dict[str, dict[str, Any]], device: torch.device) -> Place:
-    """The place that `_state` saved."""
+def _restored(state: dict[str, dict[str, Any]], names: list[str], device: torch.device) -> Place:
+    """The place that `_state` saved. names: of the descent's unknowns. Raises ValueError where it saved others."""
     if "newton" not in state:
         raise ValueError("the saved step is none of Newton's method")
-    saved = dict(state["newton"])
-    split = Split(**{name: value.to(device) for name, value in saved.pop("split").items()})
-    correction = saved.pop("correction")
-    added = None if correction["added"] is None else correction["added"].to(device)
-    saved["pairs"] = tuple((a.to(device), b.to(device)) for a, b in saved["pairs"])
+    saved = [name for name in state if name != "newton"]
+    if set(names) != set(saved):
+        raise ValueError(f"the saved step has the unknowns {', '.join(saved)}, the descent has {', '.join(names)}")
+    values = dict(_moved(state["newton"], device))
+    for name, kind in (("split", Split), ("correction", Correction), ("around", Around)):
+        values[name] = kind(**values[name])
     parameters = {n: v["parameter"].to(device) for n, v in state.items() if n not in ("delta", "newton")}
-    delta = state["delta"]["parameter"].to(device)
-    return Place(delta, parameters, split, Correction(added, correction["rest"]), **saved)
+    return Place(state["delta"]["parameter"].to(device), parameters, **values)
+
+
+def _moved(value: Any, device: torch.device) -> Any:
+    """A value with all tensors in it on a device."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, dict):
+        return {name: _moved(below, device) for name, below in value.items()}
+    return tuple(_moved(below, device) for below in value) if isinstance(value, tuple) else value

@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from recon.fit.setup import Setup
-from torchdic import Acquisition, Fidelity
+from torchdic import Acquisition, Fidelity, Microscope, Prism
 from torchdic.linear import transfer_functions
 from torchdic.scalar import number
 
@@ -24,6 +24,9 @@ DAMPING = 0.01
 
 # Cosines beyond the band limit that are kept: the volume's faces make every wave a little wider.
 BEYOND = 3
+
+# Amplitude of the empty field, relative to the brightest, below which a prism is dark.
+DARK = 1e-4
 
 # An inverse: the matrices of the lowest cosines, and the reciprocals of the others' diagonals.
 Inverse = tuple[Complex[Tensor, "y half low low"], Float[Tensor, "y half high"]]
@@ -101,6 +104,25 @@ class WeakHessian:
         S = self.spectrum(delta)
         low = (operator[0] @ S[..., : self.kept, None])[..., 0]
         return self.volume(torch.cat([low, operator[1] * S[..., self.kept :]], -1))
+
+
+def check_linear_response(microscope: Microscope, acquisition: Acquisition) -> None:
+    """Raise ValueError where the images have no response to a weak specimen, or none of which a Hessian is made."""
+    needs, instead = "Newton's method needs the linear transfer", "use method 'adam'"
+    prisms = [prism for prism in acquisition.prisms if prism is not None]
+    if prisms and not microscope.condenser_prism:
+        raise ValueError(f"{needs}: that of a prism asks for a condenser prism; {instead}")
+    if microscope.lenses is not None:
+        raise ValueError(f"{needs}, which can't hold a polarisation pupil; {instead}")
+    ideal = microscope.polarisers is None
+    if ideal and len(prisms) == len(acquisition.prisms) and all(_is_dark(prism) for prism in prisms):
+        biases = ", ".join(f"{number(prism.bias):g}" for prism in prisms)
+        raise ValueError(f"{needs}, and without bias there is none (biases {biases}); {instead}")
+
+
+def _is_dark(prism: Prism) -> bool:
+    """Whether the empty field is dark behind a prism."""
+    return abs(math.sin(number(prism.bias) / 2)) < DARK
 
 
 def axial_band(setup: Setup) -> int:
