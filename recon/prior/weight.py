@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.misfit.base import Misfit
+from recon.misfit.level import image_means
 
 # Part of what isn't noise that even the best volume leaves: voxels and directions are finite.
 MODEL = 7e-4
@@ -71,12 +72,15 @@ class FollowsNoise:
 def correlation(images: Float[Tensor, "prism focus y x"], misfit: Misfit) -> float:
     """Correlation of the residual with itself one pixel further, averaged over y and x: 0 for white noise.
 
-    images: the model's. Each image's mean residual is taken out; masked pixels count as 0.
+    images: the model's. Each image's mean residual is taken out. Pairs of pixels count of which no mask leaves one out.
     """
     residual = misfit.where_counted(images - misfit.data)
-    residual = (residual - residual.mean((2, 3), keepdim=True)) / misfit.variance.sqrt()
-    power = float(residual.square().mean())
+    residual = misfit.where_counted(residual - image_means(residual, misfit.mask)) / misfit.variance.sqrt()
+    power = float(misfit.mean(residual.square()))
     if power == 0:
         return 0.0
-    beside = [(residual * torch.roll(residual, 1, axis)).mean() for axis in (2, 3)]
-    return float(torch.stack(beside).mean()) / power
+    counted = misfit.where_counted(torch.ones_like(residual))
+    products, pairs = (
+        torch.stack([(values * values.roll(1, axis)).sum() for axis in (2, 3)]) for values in (residual, counted)
+    )
+    return float((products / pairs.clamp_min(1)).mean()) / power
