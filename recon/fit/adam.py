@@ -14,7 +14,7 @@ from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import FollowsNoise, WeightRecord, correlation
+from recon.prior.weight import FollowsNoise, WeightRecord, correlation, reach
 from torchdic.errors import UnstableError
 
 # Share of the steps before the priors know the specimen's contrast, and steps between two weights that follow the
@@ -68,9 +68,9 @@ def _move(
 ) -> _Taken:
     """Take one step of Adam. past: the plans and the weights so far."""
     setup = unknowns.into(problem.setup)
-    fidelity, plans = problem.fidelity.at(step, problem.steps, setup, past[0])
+    fidelity, plans = problem.fidelity.at(step, setup, past[0])
     try:
-        images = setup.images(fidelity)
+        images = setup.images(problem.fidelity.draft(step, problem.steps, fidelity))
     except UnstableError as error:
         raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
     misfit = problem.misfit(images)
@@ -113,7 +113,8 @@ def _followed(
             return weights
         before = math.inf
     rho = correlation(images, problem.misfit)
-    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, rho)
+    latest, past_weights = weights[-1]["tv"], [record["tv"] for record in weights]
+    weight, reason = rule.next(latest, misfit, None if math.isnan(before) else before, rho, reach(past_weights))
     return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "correlation": rho, "reason": reason})
 
 

@@ -25,23 +25,23 @@ PlanRecord = dict[str, Any]
 
 @dataclass(frozen=True)
 class GivenFidelity:
-    """One fidelity for all steps, at first with fewer condenser directions.
+    """One fidelity for all steps.
 
-    fidelity: of the images. draft_sources: condenser directions of the first 60 % of the steps, where the fidelity asks
-    for more; None is the fidelity's from the first step on.
+    fidelity: of the images. draft_sources: condenser directions of drafts, where the fidelity asks for more: the images
+    of Adam's first 60 % of the steps, and those that Newton's method corrects; None is the fidelity's.
     """
 
     fidelity: Fidelity
     draft_sources: int | None = None
 
-    def at(
-        self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
-    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+    def at(self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
         """The fidelity of a step, counted from 0, and the plans so far, which stay as they are."""
-        draft = self.draft_sources is not None and self.draft_sources < self.fidelity.sources
-        if draft and step < DRAFT * steps:
-            return replace(self.fidelity, sources=self.draft_sources), plans
         return self.fidelity, plans
+
+    def draft(self, step: int, steps: int, fidelity: Fidelity) -> Fidelity:
+        """What Adam makes of the fidelity of a step: fewer directions in the first steps."""
+        fewer = self.draft_sources is not None and self.draft_sources < fidelity.sources
+        return replace(fidelity, sources=self.draft_sources) if fewer and step < DRAFT * steps else fidelity
 
     def last(self, plans: tuple[PlanRecord, ...]) -> Fidelity:
         """The fidelity that the finished volume is judged by."""
@@ -53,18 +53,20 @@ class PlannedFidelity:
     """A fidelity that is planned for a tolerance, and again each time the volume's strength has doubled.
 
     tolerance: rms error of the images over their standard deviation, see `torchdic.plan`. draft_sources: condenser
-    directions of Newton's steps, where the plan asks for more; Adam's have all.
+    directions of the images that Newton's method corrects, where the plan asks for more; Adam's have all.
     """
 
     tolerance: float
     draft_sources: int | None = None
 
-    def at(
-        self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
-    ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
+    def at(self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
         """The fidelity of a step, counted from 0, and the plans so far with the one made for it."""
         plans = follow(plans, step, setup, self.tolerance)
         return current(plans), plans
+
+    def draft(self, step: int, steps: int, fidelity: Fidelity) -> Fidelity:
+        """What Adam makes of the fidelity of a step: the same, as it is planned to suffice."""
+        return fidelity
 
     def last(self, plans: tuple[PlanRecord, ...]) -> Fidelity:
         """The fidelity that the finished volume is judged by."""

@@ -164,7 +164,7 @@ class Problem:
         weight = None
         if recipe.tv == "auto":
             levels = measured_noise(data) if noise is None else list(noise)
-            weight = FollowsNoise(made.of_noise(levels))
+            weight = FollowsNoise(made.of_noise(levels), float(made.pixels.sum()))
         unknowns, priors = recipe.unknowns(), recipe.priors()
         return cls(setup, made, unknowns, priors, careful, recipe.most_steps, recipe.descent, weight)
 

@@ -10,8 +10,8 @@ from recon.prior.base import Majorant, Prior
 from recon.prior.schedule import held_then_annealed
 from torchdic import Volume
 
-# Rounds off the corner of |∇Δn| at 0. It is far below any contrast that DIC sees.
-SMOOTHING = 1e-5
+# Rounds off the corner of |∇Δn| at 0. It is far below any contrast that DIC sees: a tenth of a nanometre over 100 µm.
+SMOOTHING = 1e-6
 
 # Edges from this share of the specimen's Δn on count less than in proportion to their height.
 EDGE = 0.35

@@ -29,9 +29,10 @@ from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, with_values
+from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import WeightRecord, correlation
+from recon.prior.weight import WeightRecord, correlation, reach
 from torchdic import Fidelity
 from torchdic.errors import UnstableError
 
@@ -130,11 +131,13 @@ def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator
 class _Descent:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        (self.index,) = (u for u in problem.unknowns if isinstance(u, IndexDifference))
+        found = [u for u in problem.unknowns if isinstance(u, IndexDifference)]
         self.nuisances = [u for u in problem.unknowns if isinstance(u, Nuisance)]
-        others = [u.name for u in problem.unknowns if u is not self.index and u not in self.nuisances]
-        if others:
-            raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}: fit with method 'adam'")
+        others = [u.name for u in problem.unknowns if u not in found and u not in self.nuisances]
+        if len(found) != 1 or others:
+            names = ", ".join(u.name for u in problem.unknowns)
+            raise ValueError(f"Newton's method finds Δn and nuisances, not {names}: fit with method 'adam'")
+        (self.index,) = found
         self.bounds = self.index.bounds
         grid = problem.setup.volume.grid
         self.ratio = grid.spacing[2] / grid.spacing[0]
@@ -145,20 +148,22 @@ class _Descent:
         started, problem = time.perf_counter(), self.problem
         place, first, seconds = None, 0, 0.0
         if resume is not None:
-            place = _restored(resume.state, problem.misfit.data.device)
+            place = self.restored(resume)
             first, seconds, self.plans = resume.number, resume.seconds, resume.plans
-        careful = draft = hessian = now = None
+        draft = hessian = now = None
         for number in range(first, problem.steps):
+            if place is not None and place.still >= 2 and number > COARSE_STEPS:
+                return
             setup = self.placed(place)
-            careful, self.plans = problem.fidelity.at(number, problem.steps, setup, self.plans)
+            careful, self.plans = problem.fidelity.at(number, setup, self.plans)
             coarse, fine = drafts(careful, problem.fidelity.draft_sources)
             wanted = coarse if number < COARSE_STEPS else fine
             if wanted != draft:
                 draft = wanted
-                hessian = self.hessian(setup, draft)
+                hessian = self.hessian(draft)
                 if place is None:
                     place = self.start(hessian, draft)
-                elif number == COARSE_STEPS:
+                elif number == COARSE_STEPS and fine != coarse:
                     place = replace(place, pairs=(), correction=Correction())
                 now = None
             assert place is not None
@@ -167,7 +172,7 @@ class _Descent:
             exact = careful if number >= COARSE_STEPS and careful != draft else None
             if now is None:
                 formed = self.formed(place, draft)
-                if number == COARSE_STEPS:
+                if number == COARSE_STEPS and fine != coarse:
                     now, place = self.renewed(place, formed, draft, exact)
                 else:
                     now = self.judged(place, formed)
@@ -178,8 +183,6 @@ class _Descent:
             taken = seconds + time.perf_counter() - started
             values = self.values(place)
             yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
-            if place.still >= 2 and number >= COARSE_STEPS:
-                return
 
     # --- what the model says of a place -------------------------------------------------------------------------------
 
@@ -243,11 +246,17 @@ class _Descent:
         noise = self.problem.weight.noise_misfit if self.problem.weight is not None else None
         return share / max(noise or 0.0, 1e-3)
 
-    def hessian(self, setup: Setup, draft: Fidelity) -> WeakHessian:
-        """The weak specimen's Hessian, with the misfit's curvature at its data, for the directions of a draft."""
-        misfit = self.problem.misfit
-        curvature = misfit.curvature(misfit.data).expand(misfit.data.shape).mean((2, 3))
-        return WeakHessian(setup, self.voxels * curvature, draft, draft.memory // 2)
+    def hessian(self, draft: Fidelity) -> WeakHessian:
+        """The weak specimen's Hessian for the directions of a draft, with the nuisances as they are declared.
+
+        The misfit's curvature is that at images without noise, nearly: each pixel is the mean of its neighbours. A
+        camera's pixel stands for the voxels that it sees.
+        """
+        setup, misfit = self.problem.setup, self.problem.misfit
+        level, _ = neighbours(misfit.data, misfit.mask)
+        curvature = misfit.curvature(level).expand(misfit.data.shape).mean((2, 3))
+        pixels, seen = math.prod(misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
+        return WeakHessian(setup, self.voxels * pixels / seen * curvature, draft, draft.memory // 2)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""
@@ -264,6 +273,26 @@ class _Descent:
         """The sum of the priors' majorants at a place."""
         volume = self.index.put(place.delta, self.problem.setup).volume
         return sum((weight * prior.majorant(volume) for weight, prior in self.priors(place, number)), Majorant())
+
+    def restored(self, step: Step) -> Place:
+        """The place that `_state` saved. Raises ValueError where the step is another descent's."""
+        state, device = step.state, self.problem.misfit.data.device
+        if "newton" not in state:
+            raise ValueError("the saved step is none of Newton's method")
+        names = [u.name for u in (self.index, *self.nuisances)]
+        saved_names = [name for name in state if name != "newton"]
+        if set(names) != set(saved_names):
+            raise ValueError(
+                f"the saved step has the unknowns {', '.join(saved_names)}, the descent has {', '.join(names)}"
+            )
+        saved = dict(state["newton"])
+        split = Split(**{name: value.to(device) for name, value in saved.pop("split").items()})
+        correction = saved.pop("correction")
+        added = None if correction["added"] is None else correction["added"].to(device)
+        saved["pairs"] = tuple((a.to(device), b.to(device)) for a, b in saved["pairs"])
+        parameters = {u.name: state[u.name]["parameter"].to(device) for u in self.nuisances}
+        delta = state[self.index.name]["parameter"].to(device)
+        return Place(delta, parameters, split, Correction(added, correction["rest"]), **saved)
 
     # --- steps --------------------------------------------------------------------------------------------------------
 
@@ -294,7 +323,7 @@ class _Descent:
             return place
         rho = correlation(now.images, self.problem.misfit)
         before = place.before if number != COARSE_STEPS else None
-        weight, reason = rule.next(place.weight, now.misfit, before, rho)
+        weight, reason = rule.next(place.weight, now.misfit, before, rho, reach([r["tv"] for r in place.records]))
         record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "correlation": rho, "reason": reason}
         return replace(place, weight=weight, records=(*place.records, record))
 
@@ -325,7 +354,7 @@ class _Descent:
         if formed is None:
             return self.taken_back(place), now
         actual = formed.value - now.misfit + penalties
-        share = actual / predicted if predicted < 0 else (0.5 if actual < 0 else -1.0)
+        share = actual / predicted if predicted < 0 else (0.5 if actual <= 0 else -1.0)
         if share < BAD:
             there = self.judged(onward, formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
@@ -372,21 +401,7 @@ def _state(place: Place) -> dict[str, dict[str, Any]]:
     for name in ("delta", "parameters", "split", "correction"):
         del numbers[name]
     return {
-        "delta": {"parameter": place.delta},
+        IndexDifference.name: {"parameter": place.delta},
         **{name: {"parameter": parameter} for name, parameter in place.parameters.items()},
         "newton": {**numbers, "split": vars(place.split), "correction": place.correction.state()},
     }
-
-
-def _restored(state: dict[str, dict[str, Any]], device: torch.device) -> Place:
-    """The place that `_state` saved."""
-    if "newton" not in state:
-        raise ValueError("the saved step is none of Newton's method")
-    saved = dict(state["newton"])
-    split = Split(**{name: value.to(device) for name, value in saved.pop("split").items()})
-    correction = saved.pop("correction")
-    added = None if correction["added"] is None else correction["added"].to(device)
-    saved["pairs"] = tuple((a.to(device), b.to(device)) for a, b in saved["pairs"])
-    parameters = {n: v["parameter"].to(device) for n, v in state.items() if n not in ("delta", "newton")}
-    delta = state["delta"]["parameter"].to(device)
-    return Place(delta, parameters, split, Correction(added, correction["rest"]), **saved)
