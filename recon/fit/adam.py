@@ -120,5 +120,6 @@ def _followed(
         before = math.inf
     white = whiteness(images, problem.misfit)
     found = max(contrast(delta), 1e-9)
-    weight, reason = rule.next(weights[-1]["tv"], misfit, None if math.isnan(before) else before, white, EDGE * found)
+    past_weights = [record["tv"] for record in weights]
+    weight, reason = rule.next(past_weights, misfit, None if math.isnan(before) else before, white, EDGE * found)
     return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "white": white, "reason": reason})

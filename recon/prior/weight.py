@@ -9,7 +9,9 @@ residual's high frequencies are as strong as all, it is white, and no more of th
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -21,8 +23,13 @@ from recon.misfit.base import Misfit
 # Part of what isn't noise that even the best volume leaves: voxels and directions are finite.
 MODEL = 7e-4
 
-# The weight moves by the misfit's ratio to its aim to this power, by TWICE at most.
-GAIN, TWICE = 15.0, 2.0
+# A specimen whose part of the misfit is less than this many standard errors of the noise's isn't seen.
+SURE = 2.0
+
+# The weight moves by the misfit's ratio to its aim to this power, by TWICE at most. Where that is too far, as it is on
+# bright stacks, whose misfit hangs on the weight, the weight swings about its place: each time a long move turns back,
+# half of it is the most, and where it goes on, AGAIN times it.
+GAIN, TWICE, AGAIN = 15.0, 2.0, 1.2
 
 # A misfit that fell by more than this share in the last step is still on its way.
 FALLING = 0.03
@@ -32,7 +39,7 @@ HIGH = 0.35
 
 # The residual's noise is believed within these factors of the noise that was measured in the images: below lies what is
 # smooth from pixel to pixel, above what the model can't show.
-LEAST, MOST = 0.93, 1.2
+LEAST, MOST = 0.985, 1.2
 
 # Weight times the width of an edge that is usual. The noise of finite images is known to within its standard error.
 # Within UNSURE of these, where weights a factor of FAR apart lead to all but the same misfit, the usual weight is
@@ -64,20 +71,39 @@ class FollowsNoise:
         noise = misfit * white
         if self.noise_misfit is not None:
             noise = min(max(noise, LEAST * self.noise_misfit), MOST * self.noise_misfit)
-        unsure = UNSURE * math.sqrt(2 / self.pixels) * min(max(math.log(usual) / math.log(FAR), -1.0), 1.0)
+        error = math.sqrt(2 / self.pixels)
+        if noise * (1 + SURE * error) >= 1:  # an empty volume explains the images
+            return max(1.0, noise)
+        unsure = UNSURE * error * min(max(math.log(usual) / math.log(FAR), -1.0), 1.0)
         return noise * (1 - unsure) + MODEL * max(0.0, 1 - noise)
 
-    def next(self, weight: float, misfit: float, before: float | None, white: float, width: float) -> tuple[float, str]:
+    def next(
+        self, weights: Sequence[float], misfit: float, before: float | None, white: float, width: float
+    ) -> tuple[float, str]:
         """The next weight, and the reason.
 
-        misfit: of the current volume. before: the misfit one accepted step earlier; None at first. white: `whiteness`
-        of the current residual. width: of an edge, in Δn.
+        weights: so far, the oldest first. misfit: of the current volume. before: the misfit one accepted step earlier;
+        None at first. white: `whiteness` of the current residual. width: of an edge, in Δn.
         """
+        weight = weights[-1]
         aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"
-        factor = min(max((aim / misfit) ** GAIN, 1 / TWICE), TWICE)
+        longest = reach(weights)
+        factor = math.exp(min(max(GAIN * math.log(aim / misfit), -longest), longest))
         return weight * factor, "the volume follows the noise" if factor > 1 else "the priors hold the volume back"
+
+
+def reach(weights: Sequence[float]) -> float:
+    """How far the logarithm of the weight may move, after these weights, the oldest first."""
+    longest = math.log(TWICE)
+    moves = [math.log(after / before) for before, after in pairwise(weights) if after != before]
+    for last, move in pairwise(moves):
+        if last * move > 0:
+            longest = min(AGAIN * longest, math.log(TWICE))
+        elif abs(move) > longest / 2:
+            longest /= 2
+    return longest
 
 
 def whiteness(images: Float[Tensor, "prism focus y x"], misfit: Misfit) -> float:

@@ -342,7 +342,8 @@ class _Descent:
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
         white = whiteness(now.images, self.problem.misfit)
-        weight, reason = rule.next(place.weight, now.misfit, place.before, white, EDGE * place.scale)
+        weights = [record["tv"] for record in place.records] or [place.weight]
+        weight, reason = rule.next(weights, now.misfit, place.before, white, EDGE * place.scale)
         record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "white": white, "reason": reason}
         return replace(place, weight=weight, records=(*place.records, record))
 

@@ -34,10 +34,6 @@ class Split:
         """Anew, at a volume."""
         return cls(delta, delta.new_zeros(3, *delta.shape), torch.zeros_like(delta))
 
-    def rescaled(self, edges: float, copy: float) -> "Split":
-        """With the penalties divided by these factors."""
-        return Split(self.free, self.edges * edges, self.copy * copy)
-
 
 @dataclass(frozen=True)
 class Penalties:
