@@ -406,16 +406,16 @@ def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkey
 @pytest.mark.parametrize(
     "room", [(2000, "4 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
 )
-@pytest.mark.parametrize("start", ["linear", "zero"])
+@pytest.mark.parametrize("recipe", [{}, {"method": "adam"}, {"method": "adam", "start": "zero"}], ids=str)
 @pytest.mark.usefixtures("no_pictures")
 def test_a_reconstruction_without_room_is_refused_before_it_begins(
-    write, run, refused, monkeypatch, tmp_path, start, room
+    write, run, refused, monkeypatch, tmp_path, recipe, room
 ):
     free, wanted = room
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())
     monkeypatch.setattr("torchdic.memory.free.available", lambda: free)
-    line = refused("reconstruct", write({"reconstruction.start": start}))
+    line = refused("reconstruct", write({f"reconstruction.{key}": value for key, value in recipe.items()}))
     assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before

@@ -167,6 +167,31 @@ def test_defocus_and_object_aberration_are_read_and_dumped(write, tmp_path, meth
     assert equal(load(again), config)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "read"),
+    [
+        ("reconstruction.learn", ["brightness"], ("brightness",)),
+        ("reconstruction.learn", ["bias", "drift", "focus", "shear"], ("bias", "drift", "focus", "shear")),
+        ("reconstruction.tv", "auto", "auto"),
+        ("reconstruction.tv", [20, 5], (20.0, 5.0)),
+        ("reconstruction.margin", 8, 8),
+        ("reconstruction.margin", "auto", "auto"),
+        ("reconstruction.draft_sources", "auto", "auto"),
+        ("reconstruction.draft_sources", "none", None),
+        ("reconstruction.draft_sources", 12, 12),
+        ("reconstruction.method", "opl", "opl"),
+        ("data.gain", 0.5, 0.5),
+    ],
+)
+def test_a_value_is_read_and_survives_its_file(write, tmp_path, key, value, read):
+    config = load(write(changed(key, value)))
+    section, name = key.split(".")
+    assert getattr(getattr(config, section), name) == read
+    again = tmp_path / "again.toml"
+    again.write_text(dump(config), encoding="utf-8")
+    assert equal(load(again), config)
+
+
 def test_a_whole_number_serves_as_a_float(write):
     config = load(write(CONTRACT.replace("background = 1.56", "background = 2").replace("-4.0,", "-4,")))
     assert config.volume.background == 2.0
@@ -234,7 +259,11 @@ def test_a_configuration_made_in_code_survives_its_file(tmp_path):
 
 def test_the_resolved_configuration_spells_every_default_out(write):
     values = tomllib.loads(dump(load(write(CONTRACT))))
-    assert values["reconstruction"]["steps"] == Recipe().steps
+    usual = {f.name: getattr(Recipe(), f.name) for f in dataclasses.fields(Recipe)}
+    spelled = {name: value for name, value in usual.items() if name not in ("bounds", "learn") and value is not None}
+    assert values["reconstruction"].items() >= spelled.items()
+    assert values["reconstruction"] | {"learn": [], "bounds": {"lower": 0.0}} == values["reconstruction"]
+    assert {"steps", "l1"} & set(values["reconstruction"]) == set()  # left to the method
     assert values["simulation"] == {"seed": 0, "exact": False}
     assert "specimen" not in values
 
@@ -282,7 +311,15 @@ def test_a_key_that_is_unknown_or_missing_is_named(write, key, value, message):
         ("microscope.objective.na", [0.9], "must be a number"),
         ("volume.shape", 6, "must be an array of 3 values"),
         ("volume.shape", [6, 16], "must be an array of 3 values"),
-        ("reconstruction.tv", 10, "must be an array of 2 values"),
+        ("reconstruction.tv", 10, "must be 'auto', or an array of the first and the last weight"),
+        ("reconstruction.tv", "noise", "must be 'auto', or an array of the first and the last weight"),
+        ("reconstruction.tv", [1.0], "must be 'auto', or an array of the first and the last weight"),
+        ("reconstruction.method", "lbfgs", "must be one of 'newton', 'adam', 'linear', 'opl'"),
+        ("reconstruction.prior", "l2", "must be one of 'log-tv', 'tv', 'smooth'"),
+        ("reconstruction.misfit", "mean", "must be one of 'gaussian', 'poisson', 'robust'"),
+        ("reconstruction.learn", "bias", "must be an array"),
+        ("reconstruction.margin", "wide", "must be a whole number"),
+        ("reconstruction.draft_sources", "few", "must be a whole number"),
         ("reconstruction.steps", 10.0, "must be a whole number"),
         ("reconstruction.steps", True, "must be a whole number"),
         ("fidelity.sources", "12", "must be a whole number"),
@@ -365,6 +402,13 @@ def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, nam
         ),
         ("fidelity.padding", -1, ["fidelity", "padding -1", "at least 0"]),
         ("reconstruction.steps", 0, ["reconstruction", "steps 0", "at least 1"]),
+        ("reconstruction.margin", -1, ["reconstruction", "margin -1", "at least 0"]),
+        ("reconstruction.tv", [-1.0, 1.0], ["reconstruction", "tv -1.0", "at least 0"]),
+        ("reconstruction.l1", -1.0, ["reconstruction", "l1 -1.0", "at least 0"]),
+        ("reconstruction.learn", ["colour"], ["reconstruction", "learn 'colour'", "'brightness', 'bias', 'drift'"]),
+        ("reconstruction.learn", ["bias", "bias"], ["reconstruction", "learn ['bias', 'bias']", "twice"]),
+        ("data.gain", 0.0, ["data", "gain 0.0", "above 0"]),
+        ("data.read_noise", -1.0, ["data", "read_noise -1.0", "at least 0"]),
         ("reconstruction.learning_rate", -1, ["reconstruction", "learning_rate -1", "above 0"]),
         ("reconstruction.tv", [math.nan, 1], ["reconstruction", "tv nan", "at least 0"]),
         ("reconstruction.checkpoint_every", 0, ["reconstruction", "checkpoint_every 0", "at least 1"]),

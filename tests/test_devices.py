@@ -144,10 +144,11 @@ def test_thin_object_images_there_as_here():
     torch.testing.assert_close(bring(there), here)
 
 
-def test_descent_goes_there_as_here(values):
+@pytest.mark.parametrize("recipe", [Recipe(steps=10), Recipe("adam", 2)], ids=["newton", "adam"])
+def test_descent_goes_there_as_here(values, recipe):
     data = images(values, SCOPES["plain"], FIDELITY).detach()
     settings = [Prism((0.07, -0.19), 0.8), None, Prism((0.1, 0.2), 0.3)]
-    scene = GRID, 1.37, SCOPE, Acquisition(settings, [0.6, -0.4]), FIDELITY, Recipe(steps=2)
+    scene = GRID, 1.37, SCOPE, Acquisition(settings, [0.6, -0.4]), FIDELITY, recipe
     *_, here = descend(data, *scene)
     with Device():
         *_, there = descend(send(data), *scene)

@@ -612,10 +612,14 @@ CONFIG = {
     "volume": {"shape": [5, 14, 12], "spacing": [0.5, 0.2, 0.21], "background": 1.5},
     "microscope": {"wavelength": 0.546, "objective": {"na": 0.7}, "condenser": {"na": 0.4}},
     "acquisition": {"focus": [-1.0, 1.0], "prisms": [{"shear": [0.0, 0.24], "bias": 1.5}]},
-    "reconstruction": {"steps": 12, "checkpoint_every": 2, "start": "zero", "learning_rate": 2e-3},
+    "reconstruction": {"steps": 12, "checkpoint_every": 2},
     "specimen": {"kind": "gaussian_ball", "sigma": 0.5, "contrast": 0.02},
     "data": {"path": "out/stack.ome.tif"},
 }
+
+
+ADAM = {"method": "adam", "steps": 12, "checkpoint_every": 2, "start": "zero", "learning_rate": 2e-3, "tv": [60.0, 5.0]}
+METHODS = pytest.mark.parametrize("recipe", [CONFIG["reconstruction"], ADAM], ids=["newton", "adam"])
 
 
 @pytest.fixture
@@ -674,10 +678,11 @@ def test_bad_input_is_one_line_and_exit_code_2(write, tmp_path, capsys, command,
     assert not (tmp_path / "out").exists()
 
 
+@METHODS
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
-def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_path, capsys):
-    path = write()
+def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_path, capsys, recipe):
+    path = write(reconstruction=recipe)
     assert run("simulate", path, "--out", tmp_path / "out") == 0
     assert "planned for 0.2" in capsys.readouterr().out
     resolved = tomllib.loads((tmp_path / "out" / "config.resolved.toml").read_text(encoding="utf-8"))
@@ -696,10 +701,11 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
+@METHODS
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
-def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch):
-    path = write()
+def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch, recipe):
+    path = write(reconstruction=recipe)
     assert run("simulate", path, "--out", tmp_path / "out") == 0
     assert run("reconstruct", path, "--out", tmp_path / "whole") == 0
     original = recorded.minimise

@@ -388,7 +388,8 @@ def test_refinement_goes_there_as_here():
         torch.testing.assert_close(bring(value), here[name], rtol=1e-6, atol=1e-9)
 
 
-def test_a_descent_of_nuisances_goes_there_as_here():
+@pytest.mark.parametrize(("method", "steps"), [("newton", 4), ("adam", 2)])
+def test_a_descent_of_nuisances_goes_there_as_here(method, steps):
     known = setup(acquisition=turned(), dtype=torch.float64, margin=3)
     data = setup(dtype=torch.float64, brightness=BRIGHTNESS, drift=DRIFT, margin=3).images(FIDELITY)
     unknowns = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
@@ -396,7 +397,7 @@ def test_a_descent_of_nuisances_goes_there_as_here():
     def descended(data):
         scene = replace(known, volume=empty_medium(GRID, BACKGROUND, data))
         delta = IndexDifference(5e-3, Bounds(), "linear")
-        problem = Problem(scene, GaussianMisfit(data), [delta, *unknowns], [], GivenFidelity(FIDELITY), 2)
+        problem = Problem(scene, GaussianMisfit(data), [delta, *unknowns], [], GivenFidelity(FIDELITY), steps, method)
         *_, last = minimise(problem)
         return last.values
 

@@ -19,7 +19,7 @@ from recon.misfit.gaussian import GaussianMisfit
 from recon.report.metrics import volume_error
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint
-from recon.run.room import held_beside_images
+from recon.run.room import _ample, held_beside_images
 from torchdic import (
     Acquisition,
     Condenser,
@@ -33,6 +33,7 @@ from torchdic import (
     Volume,
     image,
 )
+from torchdic.memory.held import course_of, most
 
 BACKGROUND = 1.5
 GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
@@ -289,6 +290,33 @@ def test_room_is_found_for_what_drift_and_brightness_hold(data):
     # an image's spectrum, 8 bytes for half the pixels of each image, at the least
     assert held["drift"] >= without + 8 * data.numel() // 2
     assert held["bias"] == pytest.approx(without, abs=4096)
+
+
+def test_the_sample_of_a_descent_holds_what_its_later_steps_hold(truth, method):
+    """The room is measured on few pixels and in few steps; here it is held to all of a longer descent."""
+    grid, fidelity = Grid((5, 48, 44), (0.5, 0.2, 0.21)), Fidelity(sources=1, padding=2)
+    points, weights = MICROSCOPE.sources(1, dtype=torch.float64)
+    microscope = MICROSCOPE.lit_from(points, weights)
+    with torch.no_grad():
+        delta = GaussianBall(1.0, 0.02, BACKGROUND).delta(grid, dtype=torch.float32)
+        data = image(Volume(grid, delta, BACKGROUND), microscope, TRUE, fidelity)
+    setup = Setup(empty_medium(grid, BACKGROUND, data), microscope, TRUE)
+    made = Problem.from_recipe(data, setup, fidelity, Recipe(method, steps=18))
+
+    def descend():
+        last = None
+        for step in minimise(made):
+            last = step
+        del last
+
+    def compute():
+        learned = torch.zeros(grid.shape, requires_grad=True)
+        image(Volume(grid, learned, BACKGROUND), microscope, TRUE, fidelity).sum().backward()
+
+    held = most(course_of(descend)) - most(course_of(compute))
+    found = held_beside_images(made, GaussianMisfit, fidelity)
+    assert 0.9 * held < found < 1.5 * held
+    assert found < _ample(made)
 
 
 def test_room_is_found_for_a_problem_with_a_margin(data, method):

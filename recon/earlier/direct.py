@@ -11,7 +11,7 @@ from recon.earlier.path_length import path_length
 from recon.earlier.tikhonov import tikhonov
 from recon.fit.problem import Problem, Recipe
 from recon.fit.step import Step
-from recon.fit.unknowns import IndexDifference
+from recon.fit.unknowns import IndexDifference, with_values
 
 # The methods, by their names in a configuration.
 DIRECT = ("linear", "opl")
@@ -36,5 +36,7 @@ def solved_directly(
     seconds = time.perf_counter() - started
     values = {u.name: u.value(u.start(problem.setup, problem.misfit)) for u in problem.unknowns[1:]}
     values[IndexDifference.name] = found.delta
-    step = Step(1, math.nan, math.nan, found.delta, seconds, values, {}, (), (record,))
+    # where the fidelity has yet to be planned, it is for this volume
+    _, plans = problem.fidelity.careful(0, with_values(problem.unknowns, values, problem.setup), ())
+    step = Step(1, math.nan, math.nan, found.delta, seconds, values, {}, plans, (record,))
     return step, sections

@@ -28,11 +28,13 @@ class GivenFidelity:
     """One fidelity for all steps, at first with fewer condenser directions.
 
     fidelity: of the images. draft_sources: condenser directions of the first 60 % of Adam's steps, and of Newton's,
-    where the fidelity asks for more; None is the fidelity's from the first step on.
+    where the fidelity asks for more; None is the fidelity's from the first step on. matrices: bytes that those of a
+    weak specimen's Hessian may take; None is half of the fidelity's memory.
     """
 
     fidelity: Fidelity
     draft_sources: int | None = None
+    matrices: int | None = None
 
     def at(
         self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]
@@ -59,11 +61,12 @@ class PlannedFidelity:
     """A fidelity that is planned for a tolerance, and again each time the volume's strength has doubled.
 
     tolerance: rms error of the images over their standard deviation, see `torchdic.plan`. draft_sources: condenser
-    directions of Newton's steps, where the plan asks for more; Adam's have all.
+    directions of Newton's steps, where the plan asks for more; Adam's have all. matrices: as in `GivenFidelity`.
     """
 
     tolerance: float
     draft_sources: int | None = None
+    matrices: int | None = None
 
     def at(
         self, step: int, steps: int, setup: Setup, plans: tuple[PlanRecord, ...]

@@ -98,12 +98,15 @@ class Recipe:
         """Condenser directions of draft images; None is all."""
         return DRAFT_SOURCES[self.descent] if self.draft_sources == "auto" else self.draft_sources
 
+    @property
+    def sparse(self) -> float:
+        """Weight of the mean |Δn|, relative to that of the edges where it follows the noise."""
+        return self.l1 if self.l1 is not None else SPARSE if self.tv == "auto" else ALONE
+
     def priors(self) -> list[Prior]:
         """The priors, with weights relative to the common one where that follows the noise."""
-        follows = self.tv == "auto"
         first, last = (1.0, 1.0) if self.tv == "auto" else self.tv
-        sparse = self.l1 if self.l1 is not None else SPARSE if follows else ALONE
-        return [PRIORS[self.prior](first, last), Magnitude(sparse)]
+        return [PRIORS[self.prior](first, last), Magnitude(self.sparse)]
 
     def unknowns(self) -> list[Unknown]:
         """Δn, and what is learned beside it. Brightness comes first, as it is always learned."""

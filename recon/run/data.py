@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 
 from recon.config.schema import Config, ConfigError
+from recon.fit.newton.weak_hessian import responds_linearly
 from recon.misfit.base import spatial_variance
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
@@ -50,13 +51,20 @@ def _check_support(config: Config) -> None:
             f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
             "volume's voxels"
         )
-    sheared = any(prism is not None for prism in config.acquisition.prisms)
-    if sheared and not config.microscope.condenser_prism and config.reconstruction.start == "linear":
-        raise ConfigError(
-            "reconstruction.start: 'linear' needs a condenser prism, microscope.condenser_prism is false; use 'zero'"
-        )
-    if config.microscope.lenses is not None and config.reconstruction.start == "linear":
-        raise ConfigError("reconstruction.start: 'linear' can't hold microscope.polarisation.pupil; use 'zero'")
+    section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
+    if section.method in ("newton", "linear"):
+        asks, instead = f"reconstruction.method: {section.method!r} needs", "use method 'adam' with start 'zero'"
+    elif section.method == "adam" and section.start == "linear":
+        asks, instead = "reconstruction.start: 'linear' needs", "use 'zero'"
+    else:
+        return
+    if sheared and not config.microscope.condenser_prism:
+        raise ConfigError(f"{asks} a condenser prism, microscope.condenser_prism is false; {instead}")
+    if config.microscope.lenses is not None:
+        raise ConfigError(f"{asks} a linear transfer, which can't hold microscope.polarisation.pupil; {instead}")
+    if section.method != "adam" and not responds_linearly(config.microscope, config.acquisition):
+        biases = ", ".join(f"{float(prism.bias):g}" for prism in sheared)
+        raise ConfigError(f"{asks} a linear response, acquisition.prisms have biases {biases}: {instead}")
 
 
 def _empty_field(config: Config) -> list[float]:

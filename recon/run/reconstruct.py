@@ -52,9 +52,7 @@ def reconstruct(
     Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
     the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint saved.
     """
-    if config.tolerance is None and config.fidelity is None:
-        adam = config.reconstruction.method == "adam"
-        config = replace(config, fidelity=RECOMMENDED_FOR_ADAM if adam else RECOMMENDED)
+    config = _spelled_out(config)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
     check_room_for_volume(config.volume.grid, device)
@@ -62,14 +60,18 @@ def reconstruct(
     problem = _problem(config, data, made, measured)
     identity = _identity(config, measured, problem.misfit)
     start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
-    prepare_folder(out)
+    sections = None
     if config.reconstruction.method in DIRECT:
-        step, sections = solved_directly(config.reconstruction, problem, _noise(measured))
+        try:
+            step, sections = solved_directly(config.reconstruction, problem, _noise(measured))
+        except ValueError as error:
+            raise ConfigError(f"reconstruction.method: {config.reconstruction.method!r}: {error}") from error
+        prepare_folder(out)
         ended = Checkpoint(step, [], identity)
     else:
         check_room_for_descent(problem, made)
+        prepare_folder(out)
         ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
-        sections = None
     result = write_results(out, config, measured, problem, ended, sections)
     (out / CHECKPOINT).unlink(missing_ok=True)
     return result
@@ -84,6 +86,17 @@ def prepare_folder(out: Path) -> None:
         (out / ".writable").unlink()
     except OSError as error:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
+
+
+def _spelled_out(config: Config) -> Config:
+    """The configuration with what it leaves to the method: the fidelity, and how a descent steps."""
+    section = config.reconstruction
+    if config.tolerance is None and config.fidelity is None:
+        config = replace(config, fidelity=RECOMMENDED_FOR_ADAM if section.method == "adam" else RECOMMENDED)
+    if section.method in DIRECT:
+        return config
+    steps = replace(section, steps=section.most_steps, l1=section.sparse, draft_sources=section.drafts)
+    return replace(config, reconstruction=steps)
 
 
 def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], measured: Measured) -> Problem:

@@ -8,18 +8,25 @@ import torch
 from torch import Tensor
 
 from recon.fit.descent import minimise
+from recon.fit.newton.descent import COARSE_STEPS
+from recon.fit.newton.secants import MEMORY
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import empty_medium
 from recon.misfit.base import Misfit
+from recon.prior.weight import FollowsNoise
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
 from torchdic.forward.foresee import AMPLE
 from torchdic.memory.free import check_room, check_volume, free_bytes
 from torchdic.memory.held import course_of, most
 from torchdic.memory.signature import stand_in
 
-# Pixels along a side of the sample that is measured, and steps of its descent: the last of them hold what all hold.
-SIDE, STEPS = 40, 3
+# Pixels along a side of the sample that is measured, and steps of its descent by each method: the last of them hold
+# what all hold. Newton's hold the most once the careful ones have filled the memory of secants.
+SIDE = 40
+STEPS = {"newton": COARSE_STEPS + MEMORY + 1, "adam": 3}
+# Weight of the priors in the sample of Newton's method.
+LIGHT = 1e-9
 # More bytes than the linear start holds for each pixel, slice, and image or slice.
 LINEAR = 64
 # Arrays of the volume's size that any descent holds: Δn, its gradient and Adam's two moments.
@@ -60,8 +67,9 @@ def _ample(problem: Problem) -> int:
 def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fidelity: Fidelity) -> int:
     """Bytes that a descent holds beside an image and its gradient: measured on few pixels, scaled to the problem's.
 
-    They are those of the unknowns and what they are made of, Adam's moments, the priors, the steps that are handed out,
-    and the start. The sample has no margin: its images are as large as the volume, at least as large as the problem's.
+    They are those of the unknowns and what they are made of, the priors, the steps that are handed out, the start, and
+    what the method keeps: Adam its moments; Newton's the Hessian, the secants and the correction of draft images.
+    The sample has no margin: its images are as large as the volume, at least as large as the problem's.
     """
     known, dtype = problem.setup, problem.misfit.data.dtype
     grid = known.volume.grid
@@ -73,7 +81,12 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     # values play no part, but images of one brightness are refused
     data = torch.rand(setup.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
     ample = replace(fidelity, memory=1 << 62)
-    sample = replace(problem, setup=setup, misfit=misfit(data), fidelity=GivenFidelity(ample), steps=STEPS)
+    share = math.prod(few.shape) / math.prod(grid.shape)
+    given = GivenFidelity(ample, problem.fidelity.draft_sources, math.ceil(share * (fidelity.memory // 2)))
+    # with a light prior every step of Newton's moves, and is remembered
+    weight = FollowsNoise(0.0, first=LIGHT) if problem.method == "newton" else problem.weight
+    sample = replace(problem, setup=setup, misfit=misfit(data), weight=weight, fidelity=given)
+    sample = replace(sample, steps=STEPS[problem.method])
 
     def descend() -> None:
         last = None

@@ -288,7 +288,8 @@ class _Descent:
         """The weak specimen's Hessian for the directions of a draft."""
         values = {u.name: u.value(around.parameters[u.name]) for u in self.nuisances}
         setup = with_values(self.nuisances, values, self.problem.setup)
-        return WeakHessian(setup, self.voxels * around.curvature, draft, draft.memory // 2)
+        memory = self.problem.fidelity.matrices or draft.memory // 2
+        return WeakHessian(setup, self.voxels * around.curvature, draft, memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""

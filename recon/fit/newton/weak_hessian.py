@@ -15,7 +15,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from recon.fit.setup import Setup
-from torchdic import Acquisition, Fidelity, Microscope, Prism
+from torchdic import Acquisition, Fidelity, Microscope
 from torchdic.linear import transfer_functions
 from torchdic.scalar import number
 
@@ -114,15 +114,16 @@ def check_linear_response(microscope: Microscope, acquisition: Acquisition) -> N
         raise ValueError(f"{needs}: that of a prism asks for a condenser prism; {instead}")
     if microscope.lenses is not None:
         raise ValueError(f"{needs}, which can't hold a polarisation pupil; {instead}")
-    ideal = microscope.polarisers is None
-    if ideal and len(prisms) == len(acquisition.prisms) and all(_is_dark(prism) for prism in prisms):
+    if not responds_linearly(microscope, acquisition):
         biases = ", ".join(f"{number(prism.bias):g}" for prism in prisms)
         raise ValueError(f"{needs}, and without bias there is none (biases {biases}); {instead}")
 
 
-def _is_dark(prism: Prism) -> bool:
-    """Whether the empty field is dark behind a prism."""
-    return abs(math.sin(number(prism.bias) / 2)) < DARK
+def responds_linearly(microscope: Microscope, acquisition: Acquisition) -> bool:
+    """Whether an image changes with a weak specimen to first order: not where its empty field is dark."""
+    return microscope.polarisers is not None or any(
+        prism is None or abs(math.sin(number(prism.bias) / 2)) > DARK for prism in acquisition.prisms
+    )
 
 
 def axial_band(setup: Setup) -> int:
