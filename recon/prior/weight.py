@@ -21,7 +21,7 @@ from torch import Tensor
 from recon.misfit.base import Misfit
 
 # Part of what isn't noise that even the best volume leaves: voxels and directions are finite.
-MODEL = 7e-4
+MODEL = 5e-4
 
 # A specimen whose part of the misfit is less than this many standard errors of the noise's isn't seen.
 SURE = 2.0

@@ -84,7 +84,7 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     share = math.prod(few.shape) / math.prod(grid.shape)
     given = GivenFidelity(ample, problem.fidelity.draft_sources, math.ceil(share * (fidelity.memory // 2)))
     # with a light prior every step of Newton's moves, and is remembered
-    weight = FollowsNoise(0.0, first=LIGHT) if problem.method == "newton" else problem.weight
+    weight = FollowsNoise(0.0, data.numel(), first=LIGHT) if problem.method == "newton" else problem.weight
     sample = replace(problem, setup=setup, misfit=misfit(data), weight=weight, fidelity=given)
     sample = replace(sample, steps=STEPS[problem.method])
 
