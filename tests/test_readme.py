@@ -15,8 +15,11 @@ from torchdic.files.stack import read_stack
 README = Path(__file__).parents[1] / "README.md"
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+DOCS = README.parent / "docs"
+
+
+def blocks(language: str, page: Path = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 
 
 @pytest.fixture
@@ -55,6 +58,15 @@ def test_the_reconstruction_finds_the_cell(folder):
     result = reconstruct(load(folder / "cell.toml"), folder / "out", torch.device("cpu"))
     assert result.metrics["misfit"] < 0.01
     assert (folder / "out" / "volume.ome.tif").exists()
+
+
+def test_ones_own_misfit_prior_and_schedule_descend_by_both_methods(capsys):
+    (program,) = blocks("python", DOCS / "reconstruction.md")
+    exec(program, {"__name__": "own"})
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for method in ("newton", "adam"):
+        misfits = [float(misfit) for name, _, misfit in rows if name == method]
+        assert misfits[-1] < 0.5 * misfits[0]
 
 
 def test_the_files_that_the_readme_names_exist():
