@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -57,9 +58,10 @@ class Prior(ABC):
 
 def contrast(delta: Float[Tensor, "z y x"]) -> float:
     """The specimen's typical |Δn|: Σ|Δn|³/Σ|Δn|². It doesn't depend on how much of the volume is medium."""
-    size = delta.abs().double()
-    norm = float(size.square().sum())
-    return float(size.pow(3).sum()) / norm if norm > 0 else 0.0
+    size = delta.detach().abs()
+    squares = size.square()
+    norm = float(squares.sum(dtype=torch.float64))
+    return float(squares.mul_(size).sum(dtype=torch.float64)) / norm if norm > 0 else 0.0
 
 
 def weighted(priors: Sequence[Prior], factor: float, step: int, steps: int) -> list[tuple[float, Prior]]:
