@@ -198,7 +198,9 @@ def test_a_camera_s_pixels_play_no_part_but_by_the_weights():
 
 def test_it_stays_on_its_device():
     with Device():
-        setup = Setup(empty_medium(GRID, BACKGROUND, send(torch.zeros((), dtype=torch.float64))), MICROSCOPE, ACQUISITION)
+        setup = Setup(
+            empty_medium(GRID, BACKGROUND, send(torch.zeros((), dtype=torch.float64))), MICROSCOPE, ACQUISITION
+        )
         hessian = WeakHessian(setup, send(weights_of()), FIDELITY, AMPLE)
         x = send(ball())
         seen, solved = hessian(x), hessian.solved(hessian.inverse(1.0, 1.0), x)

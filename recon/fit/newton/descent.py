@@ -94,12 +94,12 @@ class Place:
 class Formed:
     """The images that the microscope forms of a volume, with their graph.
 
-    delta: Δn, the graph's leaf. images: (prism, focus, row, column), as formed. misfit: with the nuisances and the
+    delta: Δn, the graph's leaf. images: as formed, on the voxels of the whole volume. misfit: with the nuisances and the
     correction of the place that they were formed for; a 0-d tensor.
     """
 
     delta: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus row column"]
+    images: Float[Tensor, "prism focus y x"]
     misfit: Float[Tensor, ""]
 
     @property
@@ -110,11 +110,11 @@ class Formed:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A volume's misfit, its gradient (z, y, x), and the recorded images of the model."""
+    """A volume's misfit, its gradient (z, y, x), and the recorded images of the model (prism, focus, row, column)."""
 
     misfit: float
     gradient: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus y x"]
+    images: Float[Tensor, "prism focus row column"]
 
 
 def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
@@ -155,27 +155,21 @@ class _Descent:
             if place is not None and place.still >= 2 and number > COARSE_STEPS:
                 return
             setup = self.placed(place)
-            careful, self.plans = problem.fidelity.at(number, setup, self.plans)
+            known = self.plans
+            careful, self.plans = problem.fidelity.at(number, setup, known)
             coarse, fine = drafts(careful, problem.fidelity.draft_sources)
             wanted = coarse if number < COARSE_STEPS else fine
-            if wanted != draft:
-                draft = wanted
-                hessian = self.hessian(draft)
-                if place is None:
-                    place = self.start(hessian, draft)
-                elif number == COARSE_STEPS and fine != coarse:
-                    place = replace(place, pairs=(), correction=Correction())
-                now = None
-            assert place is not None
-            assert hessian is not None
-            assert draft is not None
+            anew = len(self.plans) > len(known) or (number == COARSE_STEPS and careful != coarse)
+            if draft is None or hessian is None or wanted != draft:
+                draft, hessian, now = wanted, self.hessian(wanted), None
+            if place is None:
+                place = self.start(hessian, draft)
+            elif anew:
+                place = replace(place, pairs=(), correction=Correction())
             exact = careful if number >= COARSE_STEPS and careful != draft else None
-            if now is None:
+            if now is None or anew:
                 formed = self.formed(place, draft)
-                if number == COARSE_STEPS and fine != coarse:
-                    now, place = self.renewed(place, formed, draft, exact)
-                else:
-                    now = self.judged(place, formed)
+                now, place = self.renewed(place, formed, draft, exact) if anew else (self.judged(place, formed), place)
             place = self.weighted(place, now, number)
             loss = now.misfit + self.penalty(place, place.delta, number)
             misfit = now.misfit
@@ -335,7 +329,7 @@ class _Descent:
         drafted: the fidelity of the images, and the careful one to which they are corrected, if they are.
         """
         damping, majorant = place.damping * hessian.mean, self.majorant(place, number)
-        secants = Secants(lambda delta: hessian(delta) + damping * delta, place.pairs)
+        secants = Secants(hessian, place.pairs)
         width = EDGE * place.scale * (place.width if place.contrast > 0 else 1.0)
         total = sum(weight for weight, prior in self.priors(place, number)) or 1.0
         tie = Penalties(total / (PENALTY * width), hessian.mean)
