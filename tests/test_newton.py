@@ -176,7 +176,6 @@ def test_no_other_volume_nearby_has_a_lower_objective(scene):
 
 def test_the_result_scales_with_the_datas_contrast(scene):
     """Δn and noise a tenth as large: the same volume a tenth as large, but for the second order in Δn."""
-    delta, _, _, _ = scene
     results = []
     for height in (0.004, 0.0004):
         setup = setup_of(bead(height))
@@ -310,7 +309,7 @@ def test_the_pixels_of_a_camera_may_be_larger_than_voxels():
 
 
 def test_float64_stays_float64(scene, plain):
-    delta, setup, data, _ = scene
+    delta, _, data, _ = scene
     steps = fitted(data.double(), setup_of(delta.double()), Recipe(steps=9))
     assert steps[-1].delta.dtype == torch.float64
     assert volume_error(plain[8].delta.double(), steps[-1].delta) < 0.02
@@ -411,7 +410,7 @@ def test_drafts_have_fewer_directions_and_no_padding():
 
 
 def test_a_correction_makes_drafts_careful_and_rests_where_it_hardly_moves(scene):
-    delta, setup, _, _ = scene
+    _, setup, _, _ = scene
     careful, draft = Fidelity(sources=18), Fidelity(sources=4)
     formed = setup.formed(draft)
     made = Correction().renewed(setup, formed, careful, lambda change: 1.0)
@@ -531,7 +530,7 @@ def test_unknowns_that_are_neither_index_nor_nuisance_are_refused(scene):
 
     problem = problem_of(data, setup)
     for unknowns in ([*problem.unknowns, Background()], [Brightness()]):
-        with pytest.raises(ValueError, match="Newton's method finds Δn and nuisances, not .*: fit with method 'adam'"):
+        with pytest.raises(ValueError, match=r"Newton's method finds Δn and nuisances, not .*: fit with method 'adam'"):
             next(minimise_by_newton(replace(problem, unknowns=unknowns)))
 
 
@@ -595,7 +594,7 @@ def test_the_hessian_is_the_misfits_own_along_a_smooth_direction():
 
 @pytest.mark.slow
 def test_it_goes_there_as_here(scene):
-    delta, setup, data, _ = scene
+    delta, _, data, _ = scene
     here = fitted(data.double(), setup_of(delta.double()), Recipe(steps=3), Fidelity(sources=3))[-1]
     with Device():
         there = fitted(send(data.double()), setup_of(send(delta.double())), Recipe(steps=3), Fidelity(sources=3))[-1]

@@ -63,8 +63,8 @@ CASES = {
     "bright field": (Acquisition([None], [-1.0, 0.5]), MICROSCOPE),
     "no objective": (Acquisition([Prism((0.0, 0.24), 1.5)], [0.0]), replace(MICROSCOPE, objective=None)),
     "no condenser": (Acquisition([Prism((0.0, 0.24), 1.5)], [0.4, 0.0]), replace(MICROSCOPE, condenser=None)),
-    "wider condenser": (Acquisition([Prism((0.0, 0.24), 1.5)], [0.4, 0.0]), replace(MICROSCOPE, objective=Objective(0.4))),
-}  # fmt: skip
+    "dark-field light": (Acquisition([Prism((0.0, 0.24), 1.5)], [0.4]), replace(MICROSCOPE, objective=Objective(0.4))),
+}
 each = pytest.mark.parametrize(("acquisition", "microscope"), CASES.values(), ids=CASES)
 
 

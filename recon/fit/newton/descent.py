@@ -94,8 +94,8 @@ class Place:
 class Formed:
     """The images that the microscope forms of a volume, with their graph.
 
-    delta: Δn, the graph's leaf. images: as formed, on the voxels of the whole volume. misfit: with the nuisances and the
-    correction of the place that they were formed for; a 0-d tensor.
+    delta: Δn, the graph's leaf. images: on the voxels of the whole volume. misfit: with the nuisances and the correction
+    of the place that they were formed for.
     """
 
     delta: Float[Tensor, "z y x"]
@@ -110,7 +110,7 @@ class Formed:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A volume's misfit, its gradient (z, y, x), and the recorded images of the model (prism, focus, row, column)."""
+    """A volume's misfit, its gradient, and the recorded images of the model."""
 
     misfit: float
     gradient: Float[Tensor, "z y x"]
