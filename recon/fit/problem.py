@@ -166,14 +166,18 @@ class Problem:
             careful = PlannedFidelity(fidelity, recipe.drafts)
         weight = None
         if recipe.tv == "auto":
-            levels = measured_noise(data) if noise is None else list(noise)
+            levels = measured_noise(data, made.mask) if noise is None else list(noise)
             weight = FollowsNoise(made.of_noise(levels), int(made.pixels.sum()))
         unknowns, priors = recipe.unknowns(), recipe.priors()
         return cls(setup, made, unknowns, priors, careful, recipe.most_steps, recipe.descent, weight)
 
 
-def measured_noise(data: Tensor) -> list[float] | None:
-    """Standard deviation of the noise in each prism's images; None where they are too small to tell."""
-    levels = [noise_level(images) for images in data.detach().cpu().numpy()]
-    known = [level for level in levels if level is not None]
-    return known if len(known) == len(levels) else None
+def measured_noise(data: Tensor, mask: Tensor | None = None) -> list[float] | None:
+    """Standard deviation of the noise in each prism's images; None where they are too small to tell.
+
+    mask: the pixels that count (True); None is all.
+    """
+    known = data.detach() if mask is None else data.detach().masked_fill(~mask, math.nan)
+    levels = [noise_level(images) for images in known.cpu().numpy()]
+    told = [level for level in levels if level is not None]
+    return told if len(told) == len(levels) else None

@@ -356,9 +356,7 @@ class _Descent:
         drafted: the fidelity of the images, and the careful one to which they are corrected, if they are.
         """
         damping, majorant = place.damping * hessian.mean, self.majorant(place, number)
-        # the damping is a part of the Hessian that is updated, and so of what it is to make of each step
-        pairs = [(step, change + damping * step) for step, change in place.pairs]
-        secants = Secants(lambda delta: hessian(delta) + damping * delta, pairs)
+        secants = Secants(hessian, place.pairs)
         width = EDGE * place.scale * (place.width if place.contrast > 0 else 1.0)
         total = sum(weight for weight, prior in self.priors(place, number)) or 1.0
         tie = Penalties(total / (PENALTY * width), hessian.mean)
