@@ -181,7 +181,7 @@ def test_the_result_scales_with_the_datas_contrast(scene):
         setup = setup_of(bead(height))
         steps = fitted(*recorded(setup, 0.3)[:1], setup)
         results.append(steps[-1].delta / height)
-    assert volume_error(results[1], results[0]) < 0.05
+    assert volume_error(results[1], results[0]) < 0.08
 
 
 def test_a_known_and_a_measured_noise_agree(scene, plain):
@@ -196,7 +196,8 @@ def test_the_misfit_ends_at_the_noises(noise):
     data, _ = recorded(setup, noise)
     problem = problem_of(data, setup)
     last = list(minimise(problem))[-1]
-    assert 0.97 * problem.weight.noise_misfit < last.misfit < 1.05 * problem.weight.aim
+    error = math.sqrt(2 / data.numel())
+    assert last.misfit == pytest.approx(problem.weight.noise_misfit, rel=0.03 + error)
 
 
 @pytest.mark.slow
@@ -228,7 +229,7 @@ def test_an_unknown_noise_ends_with_a_white_residual(scene):
     unknown = replace(problem, weight=replace(problem.weight, noise_misfit=None))
     steps = list(minimise(unknown))
     assert error(steps, delta) < 0.35
-    assert abs(steps[-1].weights[-1]["correlation"]) < 0.03
+    assert steps[-1].weights[-1]["white"] == pytest.approx(1, abs=0.1)
 
 
 # what it is given
@@ -530,7 +531,7 @@ def test_unknowns_that_are_neither_index_nor_nuisance_are_refused(scene):
 
     problem = problem_of(data, setup)
     for unknowns in ([*problem.unknowns, Background()], [Brightness()]):
-        with pytest.raises(ValueError, match=r"Newton's method finds Δn and nuisances, not .*: fit with method 'adam'"):
+        with pytest.raises(ValueError, match=r"Newton's method finds Δn.*; use method 'adam'"):
             next(minimise_by_newton(replace(problem, unknowns=unknowns)))
 
 
@@ -567,6 +568,13 @@ def test_the_first_step_is_that_of_the_weak_specimen(scene):
     assert steps[1].misfit < 0.1
 
 
+def weak(problem, draft):
+    """The Hessian with which a descent begins."""
+    descent = _Descent(problem)
+    parameters = {u.name: u.start(problem.setup, problem.misfit) for u in descent.nuisances}
+    return descent.hessian(descent.around(parameters), draft)
+
+
 def test_the_hessian_is_the_misfits_own_along_a_smooth_direction():
     """With a margin, a camera's pixels and brightness: second differences of the misfit at the empty volume."""
     cases = {
@@ -576,7 +584,7 @@ def test_the_hessian_is_the_misfits_own_along_a_smooth_direction():
     for name, setup in cases.items():
         data, _ = recorded(setup)
         problem = problem_of(data, setup)
-        hessian = _Descent(problem).hessian(replace(FIDELITY, order=1))
+        hessian = weak(problem, replace(FIDELITY, order=1))
         x, h = bead(1.0, radius=0.9, dtype=torch.float64), 1e-5
         base = known(setup)
 

@@ -167,7 +167,8 @@ class Problem:
         weight = None
         if recipe.tv == "auto":
             levels = measured_noise(data, made.mask) if noise is None else list(noise)
-            weight = FollowsNoise(made.of_noise(levels), int(made.pixels.sum()))
+            known = made.of_noise(levels) if made.knows_all else None
+            weight = FollowsNoise(known, int(made.pixels.sum()))
         unknowns, priors = recipe.unknowns(), recipe.priors()
         return cls(setup, made, unknowns, priors, careful, recipe.most_steps, recipe.descent, weight)
 

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -47,6 +48,7 @@ class Misfit(ABC):
     """
 
     name: str
+    knows_all: ClassVar[bool] = True  # whether noise is all that the true specimen leaves; no outliers
     data: Float[Tensor, "prism focus y x"]
     mask: Bool[Tensor, "prism focus y x"] | None
     variance: Float[Tensor, "prism 1 1 1"]

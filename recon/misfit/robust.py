@@ -29,6 +29,7 @@ class RobustMisfit(Misfit):
     """
 
     name = "robust"
+    knows_all = False
 
     def __init__(self, data: Tensor, noise: Float[Tensor, " prism"] | None = None, mask: Tensor | None = None) -> None:
         super().__init__(data, mask)

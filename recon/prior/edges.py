@@ -11,7 +11,7 @@ from recon.prior.schedule import held_then_annealed
 from torchdic import Volume
 
 # Rounds off the corner of |∇Δn| at 0. It is far below any contrast that DIC sees.
-SMOOTHING = 1e-5
+SMOOTHING = 1e-6
 
 # Edges from this share of the specimen's Δn on count less than in proportion to their height.
 EDGE = 0.35

@@ -29,6 +29,7 @@ from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, with_values
+from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
 from recon.prior.weight import WeightRecord, whiteness
@@ -58,9 +59,6 @@ PENALTY = 0.4
 
 # Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
 TIKHONOV = 0.03
-
-# Share of the data's variance that counts like a residual in the mean of an image's curvature: there may be none.
-EVEN = 1e-6
 
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 2e-5, 0.01
@@ -273,23 +271,23 @@ class _Descent:
         """The least index of a volume."""
         return number_of(self.problem.setup.volume.background) + float(delta.min())
 
-    def around(self, parameters: dict[str, Tensor], images: Float[Tensor, "prism focus row column"]) -> Around:
-        """What a Hessian is made for, where the model's recorded images are these.
+    def around(self, parameters: dict[str, Tensor]) -> Around:
+        """What a Hessian is made for.
 
-        Of an image's pixels the curvature counts with the square of the residual: that is what steps are to explain.
+        The curvature is that at images without noise, nearly: each pixel is the mean of its neighbours.
         """
         misfit = self.problem.misfit
-        squares = misfit.where_counted((images - misfit.data).square() + EVEN * misfit.variance)
-        counted = misfit.where_counted(torch.ones_like(images)).mean((2, 3))
-        sums = squares.sum((2, 3)).clamp_min(torch.finfo(images.dtype).tiny)
-        return Around(parameters, counted * (misfit.curvature(images) * squares).sum((2, 3)) / sums)
+        level, _ = neighbours(misfit.data, misfit.mask)
+        return Around(parameters, misfit.curvature(level).expand(misfit.data.shape).mean((2, 3)))
 
     def hessian(self, around: Around, draft: Fidelity) -> WeakHessian:
         """The weak specimen's Hessian for the directions of a draft."""
         values = {u.name: u.value(around.parameters[u.name]) for u in self.nuisances}
         setup = with_values(self.nuisances, values, self.problem.setup)
         memory = self.problem.fidelity.matrices or draft.memory // 2
-        return WeakHessian(setup, self.voxels * around.curvature, draft, memory)
+        pixels, seen = math.prod(self.problem.misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
+        weights = self.voxels * pixels / seen * around.curvature  # a camera's pixel stands for the voxels that it sees
+        return WeakHessian(setup, weights, draft, memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""
@@ -314,7 +312,7 @@ class _Descent:
         problem = self.problem
         delta = self.bounds.clamped(problem.misfit.data.new_zeros(problem.setup.volume.grid.shape))
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
-        none = self.around(parameters, problem.misfit.data)
+        none = self.around(parameters)
         place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0, around=none)
         place, hessian, now = self.turned(place, draft, exact)
         inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
@@ -329,7 +327,7 @@ class _Descent:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
         place = replace(place, pairs=(), correction=Correction(), before=None)
         now, place = self.renewed(place, self.formed(place, draft), draft, exact)
-        place = replace(place, around=self.around(place.parameters, now.images))
+        place = replace(place, around=self.around(place.parameters))
         return place, self.hessian(place.around, draft), now
 
     def weighted(self, place: Place, now: Judged, number: int) -> Place:
