@@ -2,7 +2,8 @@
 method.
 
     python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
-    python benchmarks/reconstruction.py ablation | nuisances | propagations | methods [--cache DIR]
+    python benchmarks/reconstruction.py ablation [NAME ...] [--cache DIR]
+    python benchmarks/reconstruction.py nuisances | propagations | methods [--cache DIR]
 
 "error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
 misfit over what noise alone leaves, for a clean stack the misfit itself. Seconds are processor seconds of one thread.
@@ -126,7 +127,7 @@ def all_scenes(options: argparse.Namespace) -> None:
 
 
 def ablation(options: argparse.Namespace) -> None:
-    """The default recipe without one of its parts, on SOME scenes: errors."""
+    """The default recipe without one of its parts, on SOME scenes or those named: errors."""
     usual = Recipe()
     plain = replace(RECOMMENDED, sources=32, padding=0)
     ways: Sequence[tuple[str, Recipe, Fidelity | None]] = (
@@ -167,11 +168,12 @@ class Memory:
 def table(
     title: str, ways: Sequence[tuple[str, Recipe, Fidelity | None]], options: argparse.Namespace, *, head: bool = True
 ) -> None:
-    """A row of errors (and processor seconds) for each way, a column for each of SOME scenes."""
+    """A row of errors (and processor seconds) for each way, a column for each of SOME scenes, or of those named."""
+    some = options.names or SOME
     if head:
-        print(f"| {title} | " + " | ".join(SOME) + " |\n" + "|---" * (len(SOME) + 1) + "|")
+        print(f"| {title} | " + " | ".join(some) + " |\n" + "|---" * (len(some) + 1) + "|")
     for name, recipe, fidelity in ways:
-        found = [fit(scenes.scene(scene, options.cache), recipe, fidelity) for scene in SOME]
+        found = [fit(scenes.scene(scene, options.cache), recipe, fidelity) for scene in some]
         print(f"| {name} | " + " | ".join(f"{f.error:.3f} ({f.seconds:.0f} s)" for f in found) + " |", flush=True)
 
 

@@ -316,7 +316,7 @@ def test_counts_are_scaled_to_the_empty_field_of_the_microscope_that_is_declared
         scope = {k: v for k, v in CONFIG["microscope"].items() if k != "camera"} | microscope | further
         path = tmp_path / f"{name}.toml"
         data = {"path": str(tmp_path / name / "stack.ome.tif"), "offset": offset}
-        parts = {"microscope": scope, "data": data, "reconstruction": {"start": "zero"}}
+        parts = {"microscope": scope, "data": data, "reconstruction": {"method": "adam", "start": "zero"}}
         path.write_text(tomli_w.dumps(CONFIG | parts), encoding="utf-8")
         assert main(["simulate", str(path), "--out", str(tmp_path / name), "--device", "cpu"]) == 0
         stacks[name] = load_data(load(path))

@@ -97,7 +97,7 @@ def test_newton_leaves_what_the_noise_leaves(truth):
         data, Setup(empty_medium(GRID, BACKGROUND, data), MICROSCOPE, TWO_SHEARS), FIDELITY, Recipe()
     )
     assert noise.weight is not None
-    assert steps[-1].misfit == pytest.approx(noise.weight.aim, rel=0.3)
+    assert steps[-1].misfit == pytest.approx(noise.weight.noise_misfit, rel=0.3)
 
 
 def test_the_linear_start_is_ahead_of_an_empty_one(truth):
@@ -117,7 +117,7 @@ def test_each_propagation_descends_on_its_own_images(truth, propagation, recipe)
         volume_error(delta.sum(0, keepdim=True), truth.sum(0, keepdim=True))
         for delta in (torch.zeros_like(truth), steps[-1].delta)
     )
-    assert last < 0.5 * first
+    assert last < 0.6 * first
     assert steps[-1].delta.dtype == torch.float32
 
 

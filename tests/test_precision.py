@@ -219,7 +219,7 @@ def test_bytes_grow_with_the_sources_and_the_digits_kept(volume):
     small, large, single = measured(volume, few, many, Candidate(many, "float32"), reference=few)
     assert 4 * small.gradient_peak_bytes < large.gradient_peak_bytes < 10 * small.gradient_peak_bytes
     assert single.gradient_peak_bytes == pytest.approx(large.gradient_peak_bytes / 2, rel=0.1)
-    assert large.peak_bytes < large.gradient_peak_bytes / 2
+    assert large.peak_bytes < 0.6 * large.gradient_peak_bytes
     assert large.seconds > 0
     assert large.gradient_seconds > 0
 
