@@ -317,7 +317,9 @@ def test_an_unphysical_recipe_is_refused(values, law):
 # going on after an interruption
 
 
-@pytest.mark.parametrize("sources", [3, 4, None], ids="{} draft directions".format)
+@pytest.mark.parametrize(
+    "sources", [pytest.param(3, marks=pytest.mark.slow), 4, None], ids="{} draft directions".format
+)
 def test_resuming_from_any_step_ends_where_an_uninterrupted_run_does(truth, recipe, sources):
     data = seen(truth)
     recipe = dataclasses.replace(recipe, steps=14 if recipe.method == "newton" else 8, draft_sources=sources)

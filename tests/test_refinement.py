@@ -388,7 +388,7 @@ def test_refinement_goes_there_as_here():
         torch.testing.assert_close(bring(value), here[name], rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize(("method", "steps"), [("newton", 4), ("adam", 2)])
+@pytest.mark.parametrize(("method", "steps"), [pytest.param("newton", 4, marks=pytest.mark.slow), ("adam", 2)])
 def test_a_descent_of_nuisances_goes_there_as_here(method, steps):
     known = setup(acquisition=turned(), dtype=torch.float64, margin=3)
     data = setup(dtype=torch.float64, brightness=BRIGHTNESS, drift=DRIFT, margin=3).images(FIDELITY)
