@@ -10,6 +10,7 @@ from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
 from recon.fit.nuisances.shear import ShearError
+from recon.fit.problem import Recipe
 from recon.fit.setup import Setup
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume
@@ -187,3 +188,14 @@ def test_focus_errors_are_added_to_the_planes(known):
 def test_an_unphysical_rate_or_step_is_refused(unknown, values, law):
     with pytest.raises(ValueError, match=f"{unknown.name}: {law}"):
         replace(unknown, **values)
+
+
+def test_brightness_beside_a_learned_bias_is_relative_to_its_prisms_mean():
+    """Else a prism's bias, its brightness and the specimen's contrast could not be told apart."""
+    index, brightness, bias = Recipe(learn=("bias",)).unknowns()
+    parameter = torch.tensor([[0.1, 0.2, -0.1], [0.3, 0.3, 0.6]], dtype=torch.float64)
+    factors = brightness.value(parameter)
+    torch.testing.assert_close(factors.log().mean(1), torch.zeros(2, dtype=torch.float64))
+    torch.testing.assert_close(factors[:, 0] / factors[:, 1], (parameter[:, 0] - parameter[:, 1]).exp())
+    assert (index.name, brightness.name, bias.name) == ("delta", "brightness", "bias")
+    assert torch.equal(Recipe().unknowns()[1].value(parameter), parameter.exp())

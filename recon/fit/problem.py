@@ -8,6 +8,7 @@ from typing import Literal
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
+from recon.fit.nuisances.brightness import Brightness, RelativeBrightness
 from recon.fit.nuisances.named import NUISANCES
 from recon.fit.planned import GivenFidelity, PlannedFidelity
 from recon.fit.setup import Setup
@@ -110,9 +111,10 @@ class Recipe:
 
     def unknowns(self) -> list[Unknown]:
         """Δn, and what is learned beside it. Brightness comes first, as it is always learned."""
-        names = ("brightness", *(name for name in self.learn if name != "brightness"))
+        others = [NUISANCES[name]() for name in self.learn if name != "brightness"]
+        brightness = RelativeBrightness() if "bias" in self.learn else Brightness()
         index = IndexDifference(self.learning_rate, self.bounds, self.start)
-        return [index, *(NUISANCES[name]() for name in names)]
+        return [index, brightness, *others]
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,3 +37,16 @@ class Brightness(Nuisance):
     def put(self, value: Tensor, setup: Setup) -> Setup:
         """The setup with this brightness."""
         return replace(setup, brightness=value)
+
+
+@dataclass(frozen=True)
+class RelativeBrightness(Brightness):
+    """The factor of each image, 1 in the geometric mean over each prism's planes.
+
+    Where a bias is learned too: it sets how bright a prism's background is, and with a factor of its own for each prism
+    the bias, that factor and the specimen's contrast could not be told apart.
+    """
+
+    def told(self, parameter: Tensor) -> Tensor:
+        """The logarithms without each prism's mean."""
+        return parameter - parameter.mean(1, keepdim=True)
