@@ -33,7 +33,7 @@ from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
 from recon.prior.weight import WeightRecord, correlation
 from torchdic import Fidelity
-from torchdic.errors import UnstableError
+from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
 
 # λ over the Hessian's mean: at first, the least, and the factors by which the ratio of actual to predicted decrease
@@ -61,6 +61,9 @@ TIKHONOV = 0.03
 
 # Share of the data's variance that counts like a residual in the mean of an image's curvature: there may be none.
 EVEN = 1e-6
+
+# Where a trial's light can't be followed, the trial is taken back.
+NO_IMAGES = (UnstableError, SidewaysError, TurnedRaysError)
 
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 1e-4, 0.01
@@ -406,10 +409,10 @@ class _Descent:
         return (*place.pairs, (step, self.voxels * (there.gradient - now.gradient)))[-MEMORY:]
 
     def tried(self, place: Place, draft: Fidelity) -> Formed | None:
-        """The images of a trial, with the nuisances and the correction as they are; None where it makes energy."""
+        """The images of a trial, with the nuisances and the correction as they are; None where it has none."""
         try:
             formed = self.formed(place, draft)
-        except UnstableError:
+        except NO_IMAGES:
             return None
         return formed if math.isfinite(formed.value) else None
 
