@@ -246,7 +246,7 @@ def test_a_descent_of_everything_goes_on_from_disk_bit_for_bit(data, tmp_path, m
     everything = problem(data, DECLARED, *NUISANCES, steps=11 if method == "newton" else 6, method=method)
     steps = list(minimise(everything))
     assert set(steps[-1].values) == {"delta", "bias", "brightness", "drift", "focus", "shear"}
-    for step in steps[0], steps[3], *steps[6:-1]:
+    for step in steps[0], steps[-4], steps[-3]:
         checkpoint.save(tmp_path / "checkpoint.pt", Checkpoint(step, [], ""))
         again = checkpoint.load(tmp_path / "checkpoint.pt", "").step
         assert alike(again, step)

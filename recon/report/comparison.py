@@ -72,7 +72,7 @@ def compare(
     for fidelity, recipe in contenders:
         name = fidelity.propagation
         steps = descend(data, truth.grid, truth.background, microscope, acquisition, fidelity, recipe)
-        *_, last = tqdm(steps, desc=f"{name:>10}", total=recipe.steps, unit="step")
+        *_, last = tqdm(steps, desc=f"{name:>10}", total=recipe.most_steps, unit="step")
         volumes[name] = last.delta.cpu()
         scores.append(_score(name, last, truth))
         write_volume(out / f"{name}.ome.tif", volumes[name], truth.grid)

@@ -34,7 +34,7 @@ from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
 from recon.prior.weight import WeightRecord, whiteness
 from torchdic import Fidelity
-from torchdic.errors import UnstableError
+from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
 
 # λ over the Hessian's mean: at first, the least, and the factors by which the ratio of actual to predicted decrease
@@ -59,6 +59,9 @@ PENALTY = 0.4
 
 # Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
 TIKHONOV = 0.03
+
+# Where a trial's light can't be followed, the trial is taken back.
+NO_IMAGES = (UnstableError, SidewaysError, TurnedRaysError)
 
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 2e-5, 0.01
@@ -403,10 +406,10 @@ class _Descent:
         return (*place.pairs, (step, self.voxels * (there.gradient - now.gradient)))[-MEMORY:]
 
     def tried(self, place: Place, draft: Fidelity) -> Formed | None:
-        """The images of a trial, with the nuisances and the correction as they are; None where it makes energy."""
+        """The images of a trial, with the nuisances and the correction as they are; None where it has none."""
         try:
             formed = self.formed(place, draft)
-        except UnstableError:
+        except NO_IMAGES:
             return None
         return formed if math.isfinite(formed.value) else None
 
