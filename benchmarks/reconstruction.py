@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -28,6 +29,7 @@ from recon.earlier.tikhonov import tikhonov
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.newton import descent
+from recon.fit.newton.secants import Secants
 from recon.fit.problem import Problem, Recipe, measured_noise
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
@@ -47,7 +49,6 @@ class Found:
     """What a fit of a scene came to."""
 
     scene: Scene
-    problem: Problem
     last: Step
     delta: Tensor
     seconds: float
@@ -88,9 +89,7 @@ def fit(
     for step in minimise(problem):
         last = step
     assert last is not None
-    margin = problem.setup.margin
-    delta = last.delta[:, margin:-margin, margin:-margin] if margin else last.delta
-    return Found(scene, problem, last, delta, time.process_time() - began)
+    return Found(scene, last, problem.setup.within_field(last.delta), time.process_time() - began)
 
 
 def row(name: str, found: Found) -> str:
@@ -143,26 +142,8 @@ def ablation(options: argparse.Namespace) -> None:
         ("Adam, 150 steps", replace(usual, method="adam"), None),
     )
     table("without", ways, options)
-    with without_secants():
-        table("without secants", (("the weak Hessian alone", usual, None),), options, head=False)
-
-
-def without_secants() -> "Memory":
-    """Newton's steps by the weak Hessian alone."""
-    return Memory(0)
-
-
-class Memory:
-    """A number of secants within a block."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __enter__(self) -> None:
-        self.usual, descent.MEMORY = descent.MEMORY, self.number
-
-    def __exit__(self, *_: object) -> None:
-        descent.MEMORY = self.usual
+    with patch.object(descent, "Secants", lambda hessian, _: Secants(hessian, ())):
+        table("without", (("no secants: the weak Hessian alone", usual, None),), options, head=False)
 
 
 def table(

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from absolute import Absolute
+from bit_for_bit import alike
 
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
@@ -48,21 +49,6 @@ def seen(truth, acquisition=TWO_SHEARS, fidelity=FIDELITY):
 
 def run(data, recipe, acquisition=TWO_SHEARS, fidelity=FIDELITY, resume=None):
     return list(descend(data, GRID, BACKGROUND, MICROSCOPE, acquisition, fidelity, recipe, resume))
-
-
-def same(a, b):
-    """Bit for bit, dicts and tensors alike."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
-def alike(a, b):
-    """Whether two steps are bit for bit the same, but for their seconds."""
-    names = [f.name for f in dataclasses.fields(a) if f.name != "seconds"]
-    return all(same(getattr(a, name), getattr(b, name)) for name in names)
 
 
 # the descent

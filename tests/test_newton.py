@@ -1,13 +1,13 @@
 """The proximal Newton descent."""
 
 import copy
-import dataclasses
 import math
 from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
+from bit_for_bit import alike
 from distant import DISTANT, Device, bring, send
 
 from recon.fit.bounds import Bounds
@@ -76,21 +76,6 @@ def fitted(data, setup, recipe=None, fidelity=FIDELITY, **others):
 
 def error(steps, delta):
     return volume_error(steps[-1].delta, delta)
-
-
-def same(a, b):
-    """Bit for bit, dicts and tensors alike."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
-def alike(a, b):
-    """Whether two steps are bit for bit the same, but for their seconds."""
-    names = [f.name for f in dataclasses.fields(a) if f.name != "seconds"]
-    return all(same(getattr(a, name), getattr(b, name)) for name in names)
 
 
 @pytest.fixture(scope="module")
@@ -572,7 +557,7 @@ def weak(problem, draft):
     """The Hessian with which a descent begins."""
     descent = _Descent(problem)
     parameters = {u.name: u.start(problem.setup, problem.misfit) for u in descent.nuisances}
-    return descent.hessian(descent.around(parameters), draft)
+    return descent.hessian(parameters, draft)
 
 
 def test_the_hessian_is_the_misfits_own_along_a_smooth_direction():

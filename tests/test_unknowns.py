@@ -1,8 +1,9 @@
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
+from bit_for_bit import alike
 
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
@@ -81,20 +82,6 @@ def problem(data, acquisition, *more, steps=40, method="adam"):
 @pytest.fixture(params=["newton", "adam"])
 def method(request):
     return request.param
-
-
-def same(a, b):
-    """Bit for bit, dicts and tensors alike."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, tuple):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
-
-
-def alike(a, b):
-    """Whether two steps are bit for bit the same, but for their seconds."""
-    return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.name != "seconds")
 
 
 def test_a_bias_that_is_10_degrees_off_is_found_beside_the_volume(data, truth):

@@ -103,25 +103,9 @@ def _optional(value: Any, kind: Any) -> Any:
     return converter.structure(value, next(k for k in get_args(kind) if k is not type(None)))
 
 
-def _scale(value: Any, _: Any) -> float | str:
-    return value if value == "background" else _number(value, float)
-
-
-def _weights(value: Any, _: Any) -> Any:
-    if value == "auto":
-        return value
-    try:
-        return _pair(value, None)
-    except ValueError as error:
-        raise ValueError(f"{value!r} must be 'auto', or an array of the first and the last weight") from error
-
-
-def _optional_number_or_auto(value: Any, _: Any) -> Any:
-    return value if value == "auto" else _optional(value, int | None)
-
-
-def _number_or_auto(value: Any, _: Any) -> Any:
-    return value if value == "auto" else _whole_number(value, int)
+def _or(word: str, hook: Hook) -> Hook:
+    """A hook for a word, or for what another hook converts."""
+    return lambda value, kind: value if value == word else hook(value, kind)
 
 
 # --- from TOML: arrays ------------------------------------------------------------------------------------------------
@@ -136,6 +120,13 @@ def _array_of_fixed_length(value: Any, kind: Any) -> tuple[Any, ...]:
 
 def _pair(value: Any, _: Any) -> tuple[Any, ...]:
     return _array_of_fixed_length(value, tuple[float, float])
+
+
+def _weights(value: Any, _: Any) -> tuple[Any, ...]:
+    try:
+        return _pair(value, None)
+    except ValueError as error:
+        raise ValueError(f"{value!r} must be 'auto', or an array of the first and the last weight") from error
 
 
 def _array_of(hook: Hook) -> Hook:
@@ -242,12 +233,12 @@ FIELDS: dict[type, dict[str, Hook]] = {
     Condenser: {"points": _tensor, "weights": _tensor},
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _array_of(_number)),
     Acquisition: {"prisms": _array_of(_prism), "focus": _array_of(_number)},
-    DataSection: {"scale": _scale},
+    DataSection: {"scale": _or("background", _number)},
     ReconstructionSection: {
-        "tv": _weights,
+        "tv": _or("auto", _weights),
         "learn": _array_of(_string),
-        "draft_sources": _optional_number_or_auto,
-        "margin": _number_or_auto,
+        "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
+        "margin": _or("auto", _whole_number),
     },
     Config: {"candidates": _array_of(_candidate)},
 }

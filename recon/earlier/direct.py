@@ -12,9 +12,7 @@ from recon.earlier.tikhonov import tikhonov
 from recon.fit.problem import Problem, Recipe
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, with_values
-
-# The methods, by their names in a configuration.
-DIRECT = ("linear", "opl")
+from recon.prior.weight import record
 
 
 def solved_directly(
@@ -32,11 +30,10 @@ def solved_directly(
         found = path_length(data, problem.setup, noise)
         sections = found.opl
     weight = found.weight if math.isfinite(found.weight) else None
-    record = {"step": 1, "tv": weight, "misfit": math.nan, "white": math.nan, "reason": found.rule}
     seconds = time.perf_counter() - started
     values = {u.name: u.value(u.start(problem.setup, problem.misfit)) for u in problem.unknowns[1:]}
     values[IndexDifference.name] = found.delta
     # where the fidelity has yet to be planned, it is for this volume
     _, plans = problem.fidelity.careful(0, with_values(problem.unknowns, values, problem.setup), ())
-    step = Step(1, math.nan, math.nan, found.delta, seconds, values, {}, plans, (record,))
+    step = Step(1, math.nan, math.nan, found.delta, seconds, values, {}, plans, (record(1, weight, found.rule),))
     return step, sections

@@ -14,7 +14,7 @@ from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import FollowsNoise, WeightRecord, whiteness
+from recon.prior.weight import WeightRecord, record, whiteness
 from torchdic.errors import UnstableError
 
 # Share of the steps before the priors know the specimen's contrast, and steps between two weights that follow the
@@ -50,7 +50,7 @@ def minimise_by_adam(problem: Problem, resume: Step | None = None) -> Iterator[S
 
     for step in range(first, problem.steps):
         unknowns.set_rates(adam, step, problem.steps)
-        taken = _move(problem, unknowns, adam, step, (plans, weights))
+        taken = _move(problem, unknowns, adam, step, plans, weights)
         plans, weights = taken.plans, taken.weights
         values = unknowns.values()
         delta = values.get(IndexDifference.name, problem.setup.volume.delta)
@@ -64,26 +64,21 @@ def _move(
     unknowns: Unknowns,
     adam: torch.optim.Adam,
     step: int,
-    past: tuple[tuple[PlanRecord, ...], tuple[WeightRecord, ...]],
+    plans: tuple[PlanRecord, ...],
+    weights: tuple[WeightRecord, ...],
 ) -> _Taken:
-    """Take one step of Adam. past: the plans and the weights so far."""
+    """Take one step of Adam. plans, weights: so far."""
     setup = unknowns.into(problem.setup)
-    fidelity, plans = problem.fidelity.at(step, problem.steps, setup, past[0])
+    fidelity, plans = problem.fidelity.at(step, problem.steps, setup, plans)
     try:
         images = setup.images(fidelity)
     except UnstableError as error:
         raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
     misfit = problem.misfit(images)
-    weights = past[1]
-    if problem.weight is not None and step % BETWEEN_WEIGHTS == 0:
-        weights = _followed(
-            problem,
-            problem.weight,
-            step,
-            float(misfit.detach()),
-            (weights, images.detach(), setup.volume.delta.detach()),
-        )
-    found = contrast(setup.volume.delta.detach()) if step >= UNTIL_CONTRAST * problem.steps else 0.0
+    delta = setup.volume.delta.detach()
+    if step > 0 and step % BETWEEN_WEIGHTS == 0:
+        weights = _followed(problem, step, float(misfit.detach()), images.detach(), delta, weights)
+    found = contrast(delta) if step >= UNTIL_CONTRAST * problem.steps else 0.0
     priors = [prior.at_contrast(found) for prior in problem.priors]
     loss = misfit
     for weight, prior in weighted(priors, weights[-1]["tv"] if weights else 1.0, step, problem.steps):
@@ -101,25 +96,21 @@ def _first_weight(problem: Problem, unknowns: Unknowns) -> tuple[WeightRecord, .
         return ()
     found = contrast(unknowns.into(problem.setup).volume.delta.detach())
     first = rule.first if rule.first is not None else 1 / (EDGE * max(found, 1e-4))
-    return ({"step": 0, "tv": first, "misfit": math.nan, "white": math.nan, "reason": "by the contrast"},)
+    return (record(0, first, "by the contrast"),)
 
 
 def _followed(
-    problem: Problem,
-    rule: FollowsNoise,
-    step: int,
-    misfit: float,
-    past: tuple[tuple[WeightRecord, ...], Tensor, Tensor],
+    problem: Problem, step: int, misfit: float, images: Tensor, delta: Tensor, weights: tuple[WeightRecord, ...]
 ) -> tuple[WeightRecord, ...]:
-    """The weights so far and the one for the next steps. past: the weights before, and the current images and Δn."""
-    weights, images, delta = past
+    """The weights so far, and the one for the next steps where it follows the noise.
+
+    images, delta: current ones. The first weight is held until the priors know the specimen's contrast.
+    """
+    if problem.weight is None:
+        return weights
     before = weights[-1]["misfit"]
-    if math.isnan(before) and step < UNTIL_CONTRAST * problem.steps:
-        if step == 0:
-            return weights
-        before = math.inf
-    white = whiteness(images, problem.misfit)
-    found = max(contrast(delta), 1e-9)
-    past_weights = [record["tv"] for record in weights]
-    weight, reason = rule.next(past_weights, misfit, None if math.isnan(before) else before, white, EDGE * found)
-    return (*weights, {"step": step + 1, "tv": weight, "misfit": misfit, "white": white, "reason": reason})
+    if math.isnan(before):
+        before = math.inf if step < UNTIL_CONTRAST * problem.steps else None
+    white, width = whiteness(images, problem.misfit), EDGE * max(contrast(delta), 1e-9)
+    weight, reason = problem.weight.next([past["tv"] for past in weights], misfit, before, white, width)
+    return (*weights, record(step + 1, weight, reason, misfit, white))

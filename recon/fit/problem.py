@@ -19,12 +19,15 @@ from recon.prior.base import Prior
 from recon.prior.edges import Edges, LogTotalVariation, Smoothness, TotalVariation
 from recon.prior.magnitude import Magnitude
 from recon.prior.weight import FollowsNoise
-from recon.recording.background import noise_level
+from recon.recording.background import known_levels, noise_level
 from torchdic import Fidelity
 
 # Steps at most, and condenser directions of draft images, of each descent.
 STEPS = {"newton": 20, "adam": 150}
 DRAFT_SOURCES = {"newton": 32, "adam": 24}
+
+# The methods without a descent, see `recon.earlier`.
+DIRECT = ("linear", "opl")
 
 # The priors of edges by their names.
 PRIORS: dict[str, type[Edges]] = {"log-tv": LogTotalVariation, "tv": TotalVariation, "smooth": Smoothness}
@@ -64,7 +67,7 @@ class Recipe:
     draft_sources: int | Literal["auto"] | None = "auto"
 
     def __post_init__(self) -> None:
-        if self.method not in (*STEPS, "linear", "opl"):
+        if self.method not in (*STEPS, *DIRECT):
             raise ValueError(f"method {self.method!r} must be 'newton', 'adam', 'linear' or 'opl'")
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps {self.steps} must be at least 1")
@@ -181,6 +184,4 @@ def measured_noise(data: Tensor, mask: Tensor | None = None) -> list[float] | No
     mask: the pixels that count (True); None is all.
     """
     known = data.detach() if mask is None else data.detach().masked_fill(~mask, math.nan)
-    levels = [noise_level(images) for images in known.cpu().numpy()]
-    told = [level for level in levels if level is not None]
-    return told if len(told) == len(levels) else None
+    return known_levels(noise_level(images) for images in known.cpu().numpy())

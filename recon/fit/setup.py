@@ -81,10 +81,14 @@ class Setup:
         if camera is not None and not self.sees_voxels:
             _, ny, nx = self.field.shape
             images = camera.integrate(images, (dy, dx), (ny, nx))
-        elif self.margin > 0:
-            within = slice(self.margin, -self.margin)
-            images = images[..., within, within]
+        else:
+            images = self.within_field(images)
         return self._lit(images)
+
+    def within_field(self, values: Float[Tensor, "*axes row column"]) -> Float[Tensor, "*axes y x"]:
+        """Values of the volume's pixels or voxels, without those of the margin."""
+        within = slice(self.margin, -self.margin or None)
+        return values[..., within, within]
 
     def at_rest(self, data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, "prism focus y x"]:
         """Recorded images as they would be without the drift and of brightness 1, on pixels that are voxels."""

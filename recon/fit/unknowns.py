@@ -6,7 +6,7 @@ and where in the model's setup the quantity goes. `Unknowns` are the unknowns of
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -104,6 +104,12 @@ def with_values(unknowns: Sequence[Unknown], values: Mapping[str, Tensor], setup
     return setup
 
 
+def check_saved(names: Iterable[str], saved: Iterable[str]) -> None:
+    """Raise ValueError where a saved step has other unknowns than a descent."""
+    if set(names) != set(saved):
+        raise ValueError(f"the saved step has the unknowns {', '.join(saved)}, the descent has {', '.join(names)}")
+
+
 class Unknowns:
     """The unknowns of one descent, each with its parameter.
 
@@ -123,8 +129,7 @@ class Unknowns:
     def restored(cls, unknowns: Sequence[Unknown], state: State, device: torch.device) -> "Unknowns":
         """The unknowns as `state` saved them. Raises ValueError where it saved others."""
         names = [unknown.name for unknown in unknowns]
-        if set(names) != set(state):
-            raise ValueError(f"the saved step has the unknowns {', '.join(state)}, the descent has {', '.join(names)}")
+        check_saved(names, state)
         return cls(unknowns, {name: state[name]["parameter"].to(device).clone() for name in names})
 
     def values(self) -> dict[str, Tensor]:

@@ -46,7 +46,7 @@ LEAST, MOST = 0.985, 1.2
 # preferred.
 USUAL, UNSURE, FAR = 0.8, 1.0, math.e
 
-# What the weight was at a step, the misfit and the residual's correlation there, and why it was changed, or not.
+# What the weight was from a step on, the misfit and the residual's whiteness there, and why it was changed, or not.
 WeightRecord = dict[str, Any]
 
 
@@ -92,6 +92,13 @@ class FollowsNoise:
         longest = reach(weights)
         factor = math.exp(min(max(GAIN * math.log(aim / misfit), -longest), longest))
         return weight * factor, "the volume follows the noise" if factor > 1 else "the priors hold the volume back"
+
+
+def record(
+    step: int, weight: float | None, reason: str, misfit: float = math.nan, white: float = math.nan
+) -> WeightRecord:
+    """A record of the weight as plain values, for checkpoints and metrics. step: counted from 1."""
+    return {"step": step, "tv": weight, "misfit": misfit, "white": white, "reason": reason}
 
 
 def reach(weights: Sequence[float]) -> float:

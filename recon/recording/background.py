@@ -1,6 +1,7 @@
 """The slow background and the noise of an image that also shows a specimen."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, Real
@@ -74,6 +75,13 @@ def _absolute(residual: np.ndarray) -> np.ndarray:
 def _biweight(residual: np.ndarray) -> np.ndarray:
     """Tukey's biweights. residual: relative to the median residual."""
     return np.clip(1 - (residual * (NORMAL_MAD / _TUKEY)) ** 2, 0, None) ** 2
+
+
+def known_levels(levels: Iterable[float | None]) -> list[float] | None:
+    """The noise of each prism where it is known of all of them; None where it isn't."""
+    each = list(levels)
+    known = [level for level in each if level is not None]
+    return known if len(known) == len(each) else None
 
 
 def noise_level(images: Real[np.ndarray, "*planes y x"]) -> float | None:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from recon.recording.background import background_surface, noise_level
+from recon.recording.background import background_surface, known_levels, noise_level
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
 
@@ -116,6 +116,11 @@ class Measured:
     focus: tuple[float, ...]
     pixel_size: tuple[float, float]
     prisms: tuple[PrismReport, ...]
+
+    @property
+    def noise(self) -> list[float] | None:
+        """Standard deviation of each prism's noise; None where it isn't known of all."""
+        return known_levels(report.noise for report in self.prisms)
 
 
 def prepare(stack: Stack, expected: ExpectedStack, normalisation: Normalisation | None = None) -> Measured:

@@ -10,6 +10,7 @@ from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from recon.misfit.poisson import PoissonMisfit
 from recon.misfit.robust import RobustMisfit
+from recon.recording.background import known_levels
 from recon.recording.noise import NoiseModel, noise_of_level
 from recon.recording.preparation import Measured
 
@@ -22,9 +23,8 @@ def misfit_for(config: Config, measured: Measured) -> Callable[[Tensor], Misfit]
     """
     named, model = config.reconstruction.misfit, _noise_model(config, measured)
     if named == "robust":
-        levels = [report.noise for report in measured.prisms]
-        known = [level for level in levels if level]
-        noise = torch.tensor(known) if len(known) == len(levels) else None
+        known = known_levels(report.noise or None for report in measured.prisms)  # a noise of 0 standardises nothing
+        noise = None if known is None else torch.tensor(known)
         return lambda data: RobustMisfit(data, noise)
     if named == "gaussian":
         return lambda data: GaussianMisfit(data, model)

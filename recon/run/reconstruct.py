@@ -10,8 +10,8 @@ from torch import Tensor
 
 from recon.config.conversion import flat
 from recon.config.schema import Config, ConfigError, SimulationSection
-from recon.earlier.direct import DIRECT, solved_directly
-from recon.fit.problem import Problem
+from recon.earlier.direct import solved_directly
+from recon.fit.problem import DIRECT, Problem
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.base import Misfit
 from recon.recording.cut_field import needed_margin
@@ -63,7 +63,7 @@ def reconstruct(
     sections = None
     if config.reconstruction.method in DIRECT:
         try:
-            step, sections = solved_directly(config.reconstruction, problem, _noise(measured))
+            step, sections = solved_directly(config.reconstruction, problem, measured.noise)
         except ValueError as error:
             raise ConfigError(f"reconstruction.method: {config.reconstruction.method!r}: {error}") from error
         prepare_folder(out)
@@ -106,7 +106,7 @@ def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], m
     setup = Setup(medium, config.microscope, config.acquisition, margin=margin)
     fidelity = config.fidelity or config.tolerance
     assert fidelity is not None
-    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit, _noise(measured))
+    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit, measured.noise)
 
 
 def _margin(config: Config, measured: Measured) -> int:
@@ -117,16 +117,10 @@ def _margin(config: Config, measured: Measured) -> int:
     if section.method in DIRECT or min(config.volume.shape[1:]) < LEAST_FIELD:
         return 0
     scene = config.volume.grid, config.microscope, config.volume.background
-    margin = needed_margin(measured.data, _noise(measured), *scene)
+    margin = needed_margin(measured.data, measured.noise, *scene)
     if margin > 0:
         print(f"the images show the specimen at their border: {margin} voxels are added beyond it (margin = {margin})")
     return margin
-
-
-def _noise(measured: Measured) -> list[float] | None:
-    """Standard deviation of each prism's noise; None where it isn't known of all."""
-    known = [report.noise for report in measured.prisms if report.noise is not None]
-    return known if len(known) == len(measured.prisms) else None
 
 
 def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:

@@ -17,6 +17,7 @@ from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, with_values
+from recon.recording.background import known_levels
 from recon.recording.preparation import Measured, PrismReport
 from recon.report import figures
 from recon.report.metrics import residual_rms
@@ -56,13 +57,12 @@ def metrics(
     images: the model's, of the last step. reports: what the preparation found in each prism's measured images, such as
     the standard deviation of their noise. method: that found the step.
     """
-    delta = within_field(problem, last.delta)
-    noise = [report.noise for report in reports if report.noise is not None]
+    delta = problem.setup.within_field(last.delta)
     found: dict[str, Any] = {
         "method": method,
         "propagation": problem.fidelity.last(last.plans).propagation,
         "misfit": float(problem.misfit(images)),
-        "noise_misfit": problem.misfit.of_noise(noise if len(noise) == len(reports) else None),
+        "noise_misfit": problem.misfit.of_noise(known_levels(report.noise for report in reports)),
         "residual_rms": residual_rms(images, problem.misfit.data),
         "steps": last.number,
         "seconds": round(last.seconds, 3),
@@ -78,12 +78,6 @@ def metrics(
     if last.plans:
         found["plans"] = list(last.plans)
     return found
-
-
-def within_field(problem: Problem, delta: Float[Tensor, "z row column"]) -> Float[Tensor, "z y x"]:
-    """Δn of the voxels behind the images, without the margin beyond them."""
-    margin = problem.setup.margin
-    return delta if margin == 0 else delta[:, margin:-margin, margin:-margin]
 
 
 def _known(value: Any) -> Any:
@@ -119,7 +113,7 @@ def write_results(
     """
     last, grid = ended.step, problem.setup.field
     images, data = model_images(problem, last), problem.misfit.data.cpu()
-    delta = within_field(problem, last.delta).cpu()
+    delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured.prisms, config.reconstruction.method)
     warn_of_poor_fit(found["misfit"])
     write_volume(out / "volume.ome.tif", delta, grid)

@@ -28,11 +28,11 @@ from recon.fit.planned import PlanRecord
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.step import Step, check_convergence
-from recon.fit.unknowns import IndexDifference, with_values
+from recon.fit.unknowns import IndexDifference, check_saved, with_values
 from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import WeightRecord, whiteness
+from recon.prior.weight import WeightRecord, record, whiteness
 from torchdic import Fidelity
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
@@ -68,38 +68,28 @@ STILL, STEADY = 2e-5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Around:
-    """What a Hessian is made for. A resumed descent makes the same one again.
-
-    parameters: of the nuisances, by name. curvature: of the misfit, by each pixel of an image (prism, focus).
-    """
-
-    parameters: dict[str, Tensor]
-    curvature: Float[Tensor, "prism focus"]
-
-
-@dataclass(frozen=True, eq=False)
 class Place:
     """Where a descent stands: all that is needed to go on, besides what the problem says.
 
-    delta: Δn (z, y, x). parameters: of the nuisances, by name. split: of the last model. correction: of the draft
-    images. weight: of the priors. scale: the specimen's contrast, times the width of edges over the last one.
-    around: what the Hessian was made for. damping: λ over the Hessian's mean. contrast: as scale, but 0 while the
-    priors don't know it. accepted: number of steps that were. before: the misfit one accepted step earlier.
-    moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
-    pairs: for the secants. records: of the weight.
+    delta: Δn (z, y, x). parameters: of the nuisances, by name. responding: those that the Hessian was made for, which a
+    resumed descent makes again. split: of the last model. correction: of the draft images.
+    weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
+    know it. width: of edges, over the last one. damping: λ over the Hessian's mean. accepted: number of steps that
+    were.
+    before: the misfit one accepted step earlier. moved: whether the last step was accepted. still: accepted steps in a
+    row that changed next to nothing. pairs: for the secants. records: of the weight.
     """
 
     delta: Float[Tensor, "z y x"]
     parameters: dict[str, Tensor]
+    responding: dict[str, Tensor]
     split: Split
     correction: Correction
     weight: float
     scale: float
-    around: Around
-    damping: float = FIRST
-    contrast: float = 0.0
+    known: bool = False
     width: float = WIDE
+    damping: float = FIRST
     accepted: int = 0
     before: float | None = None
     moved: bool = True
@@ -107,17 +97,23 @@ class Place:
     pairs: tuple[Pair, ...] = ()
     records: tuple[WeightRecord, ...] = ()
 
+    @property
+    def edge(self) -> float:
+        """The width of an edge, in Δn."""
+        return EDGE * self.scale * (self.width if self.known else 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class Formed:
-    """The images that the microscope forms of a volume, with their graph.
+    """The images of a volume, with their graph.
 
-    delta: Δn, the graph's leaf. images: (prism, focus, row, column), as formed. misfit: with the nuisances and the
-    correction of the place that they were formed for; a 0-d tensor.
+    delta: Δn, the graph's leaf. images: as the microscope forms them, on the volume's pixels. recorded: with the
+    correction and the nuisances of a place. misfit: of those, a 0-d tensor.
     """
 
     delta: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus row column"]
+    images: Float[Tensor, "prism focus y x"]
+    recorded: Float[Tensor, "prism focus row column"]
     misfit: Float[Tensor, ""]
 
     @property
@@ -183,7 +179,7 @@ class _Descent:
                 elif turns:
                     place, hessian, now = self.turned(place, draft, exact)
                 elif hessian is None or now is None:
-                    hessian, now = self.hessian(place.around, draft), self.judged(place, self.formed(place, draft))
+                    hessian, now = self.hessian(place.responding, draft), self.judged(self.formed(place, draft))
             except UnstableError as error:
                 raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
             place = self.weighted(place, now, number)
@@ -225,22 +221,24 @@ class _Descent:
     def formed(self, place: Place, draft: Fidelity) -> Formed:
         """The images of a place's volume and their misfit. Raises UnstableError where the slabs make energy."""
         delta = place.delta.detach().requires_grad_()
-        setup = self.placed(place, delta)
-        images = setup.formed(draft)
-        return Formed(delta, images, self.problem.misfit(setup.recorded(place.correction.to(images))))
+        return self.seen(place, delta, self.placed(place, delta).formed(draft))
 
-    def judged(self, place: Place, formed: Formed) -> Judged:
-        """The misfit and its gradient of a place, with its nuisances and its correction as they are."""
+    def seen(self, place: Place, delta: Tensor, images: Float[Tensor, "prism focus y x"]) -> Formed:
+        """Images that were formed of delta, as a place's nuisances and its correction make them."""
+        recorded = self.placed(place, delta).recorded(place.correction.to(images))
+        return Formed(delta, images, recorded, self.problem.misfit(recorded))
+
+    def judged(self, formed: Formed) -> Judged:
+        """The misfit and its gradient of a volume."""
         (gradient,) = torch.autograd.grad(formed.misfit, formed.delta)
-        with torch.no_grad():
-            images = self.placed(place).recorded(place.correction.to(formed.images.detach()))
-        return Judged(formed.value, gradient, images)
+        return Judged(formed.value, gradient, formed.recorded.detach())
 
     def renewed(self, place: Place, formed: Formed, draft: Fidelity, exact: Fidelity | None) -> tuple[Judged, Place]:
         """The misfit and its gradient of a place whose correction and nuisances are renewed before.
 
         exact: the careful fidelity to which the images are corrected; None corrects nothing.
         """
+        known = place
         if exact is not None:
             correction = place.correction.renewed(self.placed(place), formed.images, exact, self.size)
             place = replace(place, correction=correction)
@@ -249,11 +247,9 @@ class _Descent:
             place, changed = self.refined(place, formed.images.detach(), draft)
         if changed:
             formed = self.formed(place, draft)
-        else:
-            setup = self.placed(place, formed.delta)
-            misfit = self.problem.misfit(setup.recorded(place.correction.to(formed.images)))
-            formed = Formed(formed.delta, formed.images, misfit)
-        return self.judged(place, formed), place
+        elif place is not known:
+            formed = self.seen(place, formed.delta, formed.images)
+        return self.judged(formed), place
 
     def refined(self, place: Place, formed: Tensor, draft: Fidelity) -> tuple[Place, bool]:
         """The place with its nuisances refined, and whether other images must be formed for them."""
@@ -274,27 +270,23 @@ class _Descent:
         """The least index of a volume."""
         return number_of(self.problem.setup.volume.background) + float(delta.min())
 
-    def around(self, parameters: dict[str, Tensor]) -> Around:
-        """What a Hessian is made for.
+    def hessian(self, parameters: dict[str, Tensor], draft: Fidelity) -> WeakHessian:
+        """The weak specimen's Hessian for the directions of a draft. parameters: of the nuisances, by name.
 
-        The curvature is that at images without noise, nearly: each pixel is the mean of its neighbours.
+        The misfit's curvature is that at images without noise, nearly: each pixel is the mean of its neighbours.
         """
-        misfit = self.problem.misfit
+        values = {u.name: u.value(parameters[u.name]) for u in self.nuisances}
+        setup, misfit = with_values(self.nuisances, values, self.problem.setup), self.problem.misfit
         level, _ = neighbours(misfit.data, misfit.mask)
-        return Around(parameters, misfit.curvature(level).expand(misfit.data.shape).mean((2, 3)))
-
-    def hessian(self, around: Around, draft: Fidelity) -> WeakHessian:
-        """The weak specimen's Hessian for the directions of a draft."""
-        values = {u.name: u.value(around.parameters[u.name]) for u in self.nuisances}
-        setup = with_values(self.nuisances, values, self.problem.setup)
+        curvature = misfit.curvature(level).expand(misfit.data.shape).mean((2, 3))
         memory = self.problem.fidelity.matrices or draft.memory // 2
-        pixels, seen = math.prod(self.problem.misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
-        weights = self.voxels * pixels / seen * around.curvature  # a camera's pixel stands for the voxels that it sees
+        pixels, seen = math.prod(misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
+        weights = self.voxels * pixels / seen * curvature  # a camera's pixel stands for the voxels that it sees
         return WeakHessian(setup, weights, draft, memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""
-        priors = [prior.at_contrast(place.contrast * place.width) for prior in self.problem.priors]
+        priors = [prior.at_contrast(place.scale * place.width if place.known else 0.0) for prior in self.problem.priors]
         factor = 1.0 if self.problem.weight is None else place.weight
         return weighted(priors, factor, number, self.problem.steps)
 
@@ -315,8 +307,7 @@ class _Descent:
         problem = self.problem
         delta = self.bounds.clamped(problem.misfit.data.new_zeros(problem.setup.volume.grid.shape))
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
-        none = self.around(parameters)
-        place = Place(delta, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0, around=none)
+        place = Place(delta, parameters, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
         place, hessian, now = self.turned(place, draft, exact)
         inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
         linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
@@ -330,24 +321,23 @@ class _Descent:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
         place = replace(place, pairs=(), correction=Correction(), before=None)
         now, place = self.renewed(place, self.formed(place, draft), draft, exact)
-        place = replace(place, around=self.around(place.parameters))
-        return place, self.hessian(place.around, draft), now
+        return replace(place, responding=place.parameters), self.hessian(place.parameters, draft), now
 
     def weighted(self, place: Place, now: Judged, number: int) -> Place:
         """The place with the priors' contrast and weight for the next step."""
         if place.moved and place.accepted >= UNTIL_CONTRAST:
-            width = WIDE if place.contrast == 0 else max(1.0, NARROWER * place.width)
+            width = max(1.0, NARROWER * place.width) if place.known else WIDE
             found = contrast(place.delta)
-            if found > 0 and (place.contrast == 0 or place.width > 1.0):
-                place = replace(place, contrast=found, width=width, scale=found)
+            if found > 0 and (not place.known or place.width > 1.0):
+                place = replace(place, known=True, width=width, scale=found)
         rule = self.problem.weight
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
         white = whiteness(now.images, self.problem.misfit)
-        weights = [record["tv"] for record in place.records] or [place.weight]
+        weights = [past["tv"] for past in place.records] or [place.weight]
         weight, reason = rule.next(weights, now.misfit, place.before, white, EDGE * place.scale)
-        record = {"step": number + 1, "tv": weight, "misfit": now.misfit, "white": white, "reason": reason}
-        return replace(place, weight=weight, records=(*place.records, record))
+        made = record(number + 1, weight, reason, now.misfit, white)
+        return replace(place, weight=weight, records=(*place.records, made))
 
     def advanced(
         self, place: Place, now: Judged, hessian: WeakHessian, drafted: tuple[Fidelity, Fidelity | None], number: int
@@ -358,9 +348,8 @@ class _Descent:
         """
         damping, majorant = place.damping * hessian.mean, self.majorant(place, number)
         secants = Secants(hessian, place.pairs)
-        width = EDGE * place.scale * (place.width if place.contrast > 0 else 1.0)
-        total = sum(weight for weight, prior in self.priors(place, number)) or 1.0
-        tie = Penalties(total / (PENALTY * width), hessian.mean)
+        total = sum(weight for weight, _ in self.priors(place, number)) or 1.0
+        tie = Penalties(total / (PENALTY * place.edge), hessian.mean)
         inverse = hessian.inverse(tie.edges + majorant.rough, tie.copy + damping)
         solve = secants.solved(lambda right: hessian.solved(inverse, right))
         curved = hessian(place.delta) + secants(place.delta)
@@ -371,7 +360,8 @@ class _Descent:
             return self.taken_back(place), now
 
         step = trial - place.delta
-        penalties = self.penalty(place, trial, number) - self.penalty(place, place.delta, number)
+        held = self.penalty(place, place.delta, number)
+        penalties = self.penalty(place, trial, number) - held
         bent = float((step * (hessian(step) + secants(step))).sum()) / self.voxels
         predicted = float((now.gradient * step).sum()) + bent / 2 + penalties
         onward = replace(place, delta=trial, split=split)
@@ -380,14 +370,14 @@ class _Descent:
             return self.taken_back(place), now
         actual = formed.value - now.misfit + penalties
         share = actual / predicted if predicted < 0 else (0.5 if actual < 0 else -1.0)
-        objective = now.misfit + self.penalty(place, place.delta, number)
+        objective = now.misfit + held
         still = place.still + 1 if -actual < STILL * objective and self.steady(place, number) else 0
         if share < BAD and -predicted < STILL * objective:
             # the place is the minimum with these weights: it counts as reached, so that the weights go on
             onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.misfit)
             return replace(onward, still=still), now
         if share < BAD:
-            there = self.judged(onward, formed)
+            there = self.judged(formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
         factor = LONGER if share > GOOD else SHORTER if share < POOR else 1.0
         onward = replace(
@@ -437,7 +427,7 @@ def _state(place: Place) -> dict[str, dict[str, Any]]:
     numbers = {f.name: getattr(place, f.name) for f in fields(Place)}
     for name in ("delta", "parameters"):
         del numbers[name]
-    numbers |= {"split": vars(place.split), "correction": vars(place.correction), "around": vars(place.around)}
+    numbers |= {"split": vars(place.split), "correction": vars(place.correction)}
     return {
         "delta": {"parameter": place.delta},
         **{name: {"parameter": parameter} for name, parameter in place.parameters.items()},
@@ -450,10 +440,9 @@ def _restored(state: dict[str, dict[str, Any]], names: list[str], device: torch.
     if "newton" not in state:
         raise ValueError("the saved step is none of Newton's method")
     saved = [name for name in state if name != "newton"]
-    if set(names) != set(saved):
-        raise ValueError(f"the saved step has the unknowns {', '.join(saved)}, the descent has {', '.join(names)}")
+    check_saved(names, saved)
     values = dict(_moved(state["newton"], device))
-    for name, kind in (("split", Split), ("correction", Correction), ("around", Around)):
+    for name, kind in (("split", Split), ("correction", Correction)):
         values[name] = kind(**values[name])
     parameters = {n: v["parameter"].to(device) for n, v in state.items() if n not in ("delta", "newton")}
     return Place(state["delta"]["parameter"].to(device), parameters, **values)

@@ -49,8 +49,8 @@ class WeakHessian:
         each = 3 * frequencies * weights.element_size() * 2  # a matrix's entry, its inverse, and one to invert it
         self.kept = max(1, min(grid.shape[0], axial_band(setup), math.isqrt(memory // each)))
 
-        matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, self.kept, self.kept).to(torch.complex64)
-        matrix = matrix.to(torch.promote_types(weights.dtype, torch.complex64))
+        matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, self.kept, self.kept)
+        matrix = matrix.to(weights.dtype.to_complex())
         beyond = weights.new_zeros(*matrix.shape[:2], grid.shape[0] - self.kept)
         for index, focus in enumerate(setup.acquisition.focus):
             T = self._responses(setup, focus, weights[:, index], fidelity)
