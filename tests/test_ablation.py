@@ -48,7 +48,9 @@ def errors(ablation):
     return of
 
 
-@pytest.mark.parametrize("name", ["no p_z", "textbook screen", pytest.param("no amplitude", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["textbook screen", *(pytest.param(n, marks=pytest.mark.slow) for n in ("no p_z", "no amplitude"))]
+)
 def test_part_left_out_costs_what_is_stated(errors, name):
     ratio = errors(name) / torch.tensor(STATED[name])
     assert float(ratio.min()) > 1 / 1.5, errors(name)
@@ -61,6 +63,7 @@ def test_rays_and_corrected_split_step_err_by_thousandths(errors):
     assert float(errors("split step").max()) < 0.002
 
 
+@pytest.mark.slow
 def test_each_part_is_worth_a_factor_of_its_own(errors):
     """The amplitude matters more than its p_z, and either at least fivefold, out of focus twentyfold."""
     assert bool((errors("no amplitude") > 1.4 * errors("no p_z")).all())
@@ -72,6 +75,7 @@ def test_each_part_is_worth_a_factor_of_its_own(errors):
     assert float(gain[[0, 2, 3]].min()) > 40
 
 
+@pytest.mark.slow
 def test_reference_plane_at_the_exit_errs_many_times_more(errors):
     ratio = errors("at the exit") / errors("rays")
     assert float(ratio.min()) > 15, ratio
@@ -100,9 +104,8 @@ def linear(fidelity):
     return replace(fidelity, object_aberration="linear")
 
 
-@pytest.mark.parametrize(
-    ("rays", "in_focus"), [(STRAIGHT, 0.72), pytest.param(BENT, 0.45, marks=pytest.mark.slow)], ids=["straight", "bent"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("rays", "in_focus"), [(STRAIGHT, 0.72), (BENT, 0.45)], ids=["straight", "bent"])
 def test_own_defocus_halves_what_rays_without_amplitude_lack(ablation, rays, in_focus):
     """Straight rays 0.080 to 0.044, bent ones 0.080 to 0.044; in focus less, where the amplitude matters least."""
     scene = ablation.smooth_ball()
@@ -111,6 +114,7 @@ def test_own_defocus_halves_what_rays_without_amplitude_lack(ablation, rays, in_
     torch.testing.assert_close(with_ / without, torch.tensor([0.51, in_focus, 0.52, 0.545]), rtol=0.08, atol=0)
 
 
+@pytest.mark.slow
 def test_own_defocus_is_half_because_the_map_sees_the_specimen_behind_the_plane_only(ablation):
     """A ball on the plane bends light as much in front of it: twice the defocus leaves a seventh far out of focus."""
     scene = ablation.smooth_ball()
@@ -121,6 +125,7 @@ def test_own_defocus_is_half_because_the_map_sees_the_specimen_behind_the_plane_
     torch.testing.assert_close(once, torch.tensor(ablation.whole(scene, 120, linear(STRAIGHT))), rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_own_defocus_counts_twice_what_the_amplitude_does(ablation, errors):
     """Rays with their amplitude err by 0.002; with the defocus besides, by 0.010 in focus and up to 0.036 out of it."""
     twice = torch.tensor(ablation.own_defocus(ablation.smooth_ball(), 120, RAYS, "linear"))

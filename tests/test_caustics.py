@@ -137,7 +137,7 @@ def lens(slices, behind=0, contrast=0.11, n=28):
         pytest.param({}, id="linear", marks=pytest.mark.slow),
         pytest.param({"interpolation": "cubic"}, id="cubic"),
         pytest.param({"memory": 1}, id="recomputed"),
-        pytest.param({"solver": "dopri5", "tolerance": 1e-7}, id="adaptive"),
+        pytest.param({"solver": "dopri5", "tolerance": 1e-7}, id="adaptive", marks=pytest.mark.slow),
     ],
 )
 def test_empty_slices_behind_do_not_show(momentum, options):
@@ -202,7 +202,7 @@ def test_smooth_ball_is_not_searched_and_a_strong_lens_is(looks, interpolation):
     ("momentum", "interpolation"),
     [
         pytest.param((0.0, 0.0), "linear", id="axial-linear"),
-        pytest.param((0.35, -0.2), "cubic", id="oblique-cubic"),
+        pytest.param((0.35, -0.2), "cubic", id="oblique-cubic", marks=pytest.mark.slow),
         pytest.param((0.0, 0.0), "cubic", id="axial-cubic", marks=pytest.mark.slow),
         pytest.param((0.35, -0.2), "linear", id="oblique-linear", marks=pytest.mark.slow),
     ],

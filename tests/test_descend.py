@@ -28,6 +28,8 @@ FIDELITY = Fidelity(sources=6)
 ADAM = Recipe(method="adam", steps=12, tv=(20.0, 5.0), prior="tv")
 NEWTON = Recipe(steps=12)
 METHODS = {"newton": NEWTON, "adam": ADAM}
+# for laws that Adam's descent is held to in less time; test_newton holds Newton's to its own
+NEWTON_SLOW = pytest.mark.parametrize("recipe", [pytest.param("newton", marks=pytest.mark.slow), "adam"], indirect=True)
 
 
 @pytest.fixture(params=METHODS)
@@ -92,9 +94,16 @@ def test_the_linear_start_is_ahead_of_an_empty_one(truth):
 
 
 @pytest.mark.parametrize(
-    "recipe", [Recipe(), Recipe("adam", 25, start="zero", tv=(60.0, 5.0), prior="tv")], ids=["newton", "adam"]
+    ("propagation", "method"),
+    [
+        pytest.param(propagation, method, marks=() if (propagation, method) in fast else pytest.mark.slow)
+        for fast in [{("projection", "newton"), ("rays", "adam"), ("wave", "adam")}]
+        for propagation in ("projection", "rays", "wave")
+        for method in METHODS
+    ],
 )
-def test_each_propagation_descends_on_its_own_images(truth, propagation, recipe):
+def test_each_propagation_descends_on_its_own_images(truth, propagation, method):
+    recipe = Recipe() if method == "newton" else Recipe("adam", 25, start="zero", tv=(60.0, 5.0), prior="tv")
     fidelity = Fidelity(propagation, sources=4)
     steps = run(seen(truth, fidelity=fidelity), recipe, fidelity=fidelity)
     assert steps[-1].misfit < 0.2 * steps[0].misfit
@@ -117,6 +126,7 @@ def test_each_propagation_descends_on_its_own_images(truth, propagation, recipe)
     ],
     ids=["one image", "bright field", "both", "negative bias"],
 )
+@NEWTON_SLOW
 def test_any_acquisition_descends(truth, acquisition, recipe):
     data = seen(truth, acquisition)
     steps = run(data, dataclasses.replace(recipe, start="zero"), acquisition)
@@ -124,13 +134,22 @@ def test_any_acquisition_descends(truth, acquisition, recipe):
     assert float((steps[-1].delta * truth).sum()) > 0
 
 
+@NEWTON_SLOW
 def test_steps_are_numbered_from_1_and_time_goes_on(truth, recipe):
     steps = run(seen(truth), recipe)
     assert [step.number for step in steps] == list(range(1, 13))
     assert all(0 < a.seconds < b.seconds for a, b in itertools.pairwise(steps))
 
 
-@pytest.mark.parametrize("bounds", [Bounds(), Bounds(None, None), Bounds(-0.1, 0.1)], ids=["0", "none", "both"])
+@pytest.mark.parametrize(
+    ("recipe", "bounds"),
+    [
+        pytest.param(method, bounds, id=f"{method}-{name}", marks=pytest.mark.slow if name in slow else ())
+        for method, slow in (("newton", ("none", "both")), ("adam", ()))
+        for name, bounds in {"0": Bounds(), "none": Bounds(None, None), "both": Bounds(-0.1, 0.1)}.items()
+    ],
+    indirect=["recipe"],
+)
 def test_what_a_step_holds_does_not_change_any_more(truth, bounds, recipe):
     recipe = dataclasses.replace(recipe, bounds=bounds)
     steps, copies = [], []
@@ -156,14 +175,23 @@ def test_delta_stays_within_its_bounds(truth, recipe):
         assert float(step.delta.max()) <= 0.01 + 1e-8
 
 
-@pytest.mark.parametrize(("bounds", "error"), [(Bounds(None, None), 0.75), (Bounds(None, 0.0), 0.55)])
-@pytest.mark.parametrize("given", [{}, {"method": "adam", "steps": 40, "learning_rate": 2e-3, "tv": (10.0, 10.0)}])
+@pytest.mark.parametrize(
+    ("bounds", "error"), [pytest.param(Bounds(None, None), 0.75, marks=pytest.mark.slow), (Bounds(None, 0.0), 0.55)]
+)
+@pytest.mark.parametrize(
+    "given",
+    [
+        pytest.param({}, marks=pytest.mark.slow),  # test_newton holds it to the same
+        {"method": "adam", "steps": 40, "learning_rate": 2e-3, "tv": (10.0, 10.0)},
+    ],
+)
 def test_a_negative_contrast_is_found_where_the_bounds_let_it(truth, bounds, error, given):
     recipe = Recipe(**given, bounds=bounds)
     assert volume_error(run(seen(-truth), recipe)[-1].delta, -truth) < error
     assert volume_error(run(seen(-truth), Recipe(**given))[-1].delta, -truth) > 0.95  # the default ones do not
 
 
+@NEWTON_SLOW
 def test_another_misfit_is_lowered_in_its_own_measure(truth, recipe):
     data, fidelity = seen(truth), Fidelity(sources=6, order=1)  # which Newton's method asks for at each step
     setup = Setup(empty_medium(GRID, BACKGROUND, data), MICROSCOPE, TWO_SHEARS)
@@ -176,6 +204,7 @@ def test_another_misfit_is_lowered_in_its_own_measure(truth, recipe):
         assert after.misfit == pytest.approx(Absolute(data)(images).item(), rel=1e-5)
 
 
+@NEWTON_SLOW
 def test_more_total_variation_leaves_less_of_it(truth, recipe):
     data = seen(truth) + 0.01 * torch.randn(2, 3, 16, 14)
     recipe = dataclasses.replace(recipe, prior="tv", l1=0.5)
@@ -183,6 +212,7 @@ def test_more_total_variation_leaves_less_of_it(truth, recipe):
     assert total_variation(smooth, GRID.spacing) < 0.5 * total_variation(rough, GRID.spacing)
 
 
+@NEWTON_SLOW
 def test_l1_pulls_an_invisible_uniform_index_down(truth, recipe):
     recipe = dataclasses.replace(recipe, tv=(20.0, 5.0), steps=25)
     free, held = (run(seen(truth), dataclasses.replace(recipe, l1=w))[-1].delta.mean() for w in (0.0, 100.0))
@@ -202,6 +232,7 @@ def test_draft_sources_serve_the_first_60_percent_only(truth):
     assert alike(again, expected[0])
 
 
+@pytest.mark.slow
 def test_newtons_drafts_are_corrected_to_the_images_of_all_directions(truth):
     """Where it ends, the misfit is that of careful images, though its steps see few directions."""
     fidelity = Fidelity(sources=40, padding=3)
@@ -306,6 +337,7 @@ def test_an_unphysical_recipe_is_refused(values, law):
 @pytest.mark.parametrize(
     "sources", [pytest.param(3, marks=pytest.mark.slow), 4, None], ids="{} draft directions".format
 )
+@NEWTON_SLOW
 def test_resuming_from_any_step_ends_where_an_uninterrupted_run_does(truth, recipe, sources):
     data = seen(truth)
     recipe = dataclasses.replace(recipe, steps=14 if recipe.method == "newton" else 8, draft_sources=sources)
@@ -331,11 +363,13 @@ def test_a_step_of_another_method_is_refused(truth, one, other):
         run(seen(truth), one, resume=step)
 
 
+@NEWTON_SLOW
 def test_two_runs_are_bit_for_bit_the_same(truth, recipe):
     one, other = run(seen(truth), recipe), run(seen(truth), recipe)
     assert all(alike(a, b) for a, b in zip(one, other, strict=True))
 
 
+@NEWTON_SLOW
 def test_resuming_counts_the_seconds_on(truth, recipe):
     steps = run(seen(truth), recipe)
     late = dataclasses.replace(steps[5], seconds=1000.0)
@@ -379,6 +413,7 @@ def test_a_checkpoint_from_disk_ends_where_an_uninterrupted_run_does(saved, reci
         ("volume.shape = [6, 16, 14]\ndata's sha256 = abc\nfidelity.steps = 3", "fidelity.steps was absent, is 3"),
     ],
 )
+@NEWTON_SLOW
 def test_a_checkpoint_of_another_run_is_refused_with_what_changed(saved, identity, named):
     path, _, _ = saved
     with pytest.raises(CheckpointError) as caught:
@@ -390,6 +425,7 @@ def test_a_checkpoint_of_another_run_is_refused_with_what_changed(saved, identit
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", None], ids=["empty", "text", "truncated"])
+@NEWTON_SLOW
 def test_a_damaged_checkpoint_is_refused_in_one_line(saved, content):
     path, _, _ = saved
     path.write_bytes(path.read_bytes()[:-500] if content is None else content)
@@ -406,6 +442,7 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
         checkpoint.load(path, "")
 
 
+@NEWTON_SLOW
 def test_a_checkpoint_of_an_earlier_version_is_refused_in_one_line(saved):
     """One that holds the learned tensor and Adam's own state, as they were saved before unknowns had names."""
     path, _, steps = saved
@@ -421,6 +458,7 @@ def test_a_checkpoint_of_an_earlier_version_is_refused_in_one_line(saved):
     assert "\n" not in str(caught.value)
 
 
+@NEWTON_SLOW
 def test_a_checkpoint_that_fails_to_be_written_leaves_the_earlier_one(saved, monkeypatch):
     path, _, steps = saved
     before = path.read_bytes()

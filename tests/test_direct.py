@@ -31,6 +31,7 @@ CONFIG = {
 }
 RESULTS = {"volume.ome.tif", "metrics.json", "config.resolved.toml", "images.png", "sections.png"}
 METHODS = pytest.mark.parametrize("method", ["linear", "opl"])
+OPL_SLOW = pytest.mark.parametrize("method", ["linear", pytest.param("opl", marks=pytest.mark.slow)])
 
 
 @pytest.fixture
@@ -104,7 +105,7 @@ def test_path_lengths_are_left_in_µm_with_the_pixel_and_the_focus_step(write, t
         assert tif.series[0].dtype == np.float32
 
 
-@METHODS
+@OPL_SLOW
 @pytest.mark.usefixtures("no_pictures")
 def test_a_second_run_begins_anew(write, tmp_path, method):
     path, out = write(method), tmp_path / "out"
@@ -117,7 +118,7 @@ def test_a_second_run_begins_anew(write, tmp_path, method):
         assert not (out / "checkpoint.pt").exists()
 
 
-@METHODS
+@OPL_SLOW
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("no_pictures")
 def test_a_tolerance_is_planned_for_the_volume_that_was_found(write, tmp_path, method):

@@ -74,7 +74,8 @@ def leaving(n, contrast, extent, absorber=None):
     return Volume(grid, GaussianBall(0.7, contrast, N0, centre).delta(grid), N0, absorption)
 
 
-@pytest.mark.parametrize("absorber", [pytest.param(None, marks=pytest.mark.slow), 0.02])
+@pytest.mark.slow
+@pytest.mark.parametrize("absorber", [None, 0.02])
 def test_flux_through_the_last_face_is_the_incoming_one_but_for_what_is_absorbed(absorber):
     """Σ|U|²p_z over the pixels is Σ p_z0·exp(−2k0∫κ ds) over the rays, to second order in the mesh at least.
 

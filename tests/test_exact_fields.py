@@ -44,11 +44,12 @@ def errors(table, exact, case, na, propagation, steps):
     [
         pytest.param("smooth ball", 0.2, 36, 0.0003, marks=pytest.mark.slow),
         pytest.param("smooth ball", 0.5, 36, 0.0008, marks=pytest.mark.slow),
-        ("smooth ball", 0.8, 36, 0.003),
-        ("strong smooth ball", 0.8, 72, 0.011),
+        # test_reference holds a smooth ball to the same
+        pytest.param("smooth ball", 0.8, 36, 0.003, marks=pytest.mark.slow),
+        pytest.param("strong smooth ball", 0.8, 72, 0.011, marks=pytest.mark.slow),
         ("sharp bead", 0.8, 40, 0.03),
         pytest.param("strong bead", 0.2, 80, 0.035, marks=pytest.mark.slow),
-        ("strong bead", 0.8, 160, 0.044),
+        pytest.param("strong bead", 0.8, 160, 0.044, marks=pytest.mark.slow),
         pytest.param("strong bead", 0.8, 640, 0.03, marks=pytest.mark.slow),
     ],
 )
@@ -71,7 +72,12 @@ def test_rays_err_by_thousandths_on_the_strong_smooth_ball_too(table, exact):
 
 
 @pytest.mark.parametrize(
-    ("case", "na", "floor"), [("smooth ball", 0.8, 0.10), ("sharp bead", 0.8, 0.15), ("strong bead", 0.8, 0.3)]
+    ("case", "na", "floor"),
+    [
+        pytest.param("smooth ball", 0.8, 0.10, marks=pytest.mark.slow),
+        ("sharp bead", 0.8, 0.15),
+        pytest.param("strong bead", 0.8, 0.3, marks=pytest.mark.slow),
+    ],
 )
 def test_straight_rays_are_not_enough(table, exact, case, na, floor):
     """The table tells the propagations apart: its errors are not those of the comparison."""
@@ -79,6 +85,7 @@ def test_straight_rays_are_not_enough(table, exact, case, na, floor):
     assert float(found.max()) > floor, found
 
 
+@pytest.mark.slow
 def test_wider_condenser_asks_more_of_straight_rays(table, exact):
     found = [errors(table, exact, "smooth ball", na, "projection", 72).max() for na in (0.2, 0.5, 0.8)]
     assert found[0] < found[1] / 2 < found[2] / 4

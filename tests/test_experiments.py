@@ -13,7 +13,7 @@ from torchdic import Acquisition, Grid, Microscope, Objective, Prism, Volume, im
 from torchdic.files.stack import read_volume, write_stack
 
 SCRIPT = Path(__file__).parents[1] / "experiments" / "measured.py"
-SHAPE = (128, 160)
+SHAPE = (96, 112)
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ def test_bright_field_and_prisms_are_told_apart():
     assert "bias -1.2 rad" in labels[2]
 
 
-@pytest.mark.parametrize(("planes", "columns"), [(1, 1), (7, 7), (20, 7)])
+@pytest.mark.parametrize(("planes", "columns"), [(1, 1), pytest.param(7, 7, marks=pytest.mark.slow), (20, 7)])
 def test_a_stacks_planes_are_evenly_chosen_from_first_to_last(tmp_path, planes, columns):
     stack = torch.rand(2, planes, 9, 12)
     figure = figures.draw_stack(stack, PRISMS[:2], range(planes), (0.2, 0.25))

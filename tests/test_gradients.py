@@ -13,7 +13,7 @@ POINTS = torch.tensor([[0.0, 0.0], [0.31, -0.12], [-0.17, 0.24], [0.05, 0.38]], 
 NOLL = (4, 5, 6, 7, 8)
 FIDELITIES = {
     "projection": Fidelity("projection"),
-    "projection-cubic-recomputed": Fidelity("projection", interpolation="cubic", memory=1),
+    "projection-cubic-recomputed": Fidelity("projection", interpolation="cubic", steps=4, memory=1),
     "rays": Fidelity("rays"),
     "rays-cubic-recomputed": Fidelity("rays", interpolation="cubic", memory=1),
     "rays-fewer-steps": Fidelity("rays", steps=2, padding=1),
@@ -22,8 +22,10 @@ FIDELITIES = {
     "wave-recomputed": Fidelity("wave", steps=5, memory=1),
 }
 PARAMETERS = ("delta", "absorption", "background", "shear", "bias", "focus", "aberrations")
-# these cross the specimen too; the further parameters act on the field, whatever brought it
-OTHERS = {(w, n) for w in ("projection-cubic-recomputed", "wave-recomputed") for n in ("absorption", "background")}
+# what crosses the specimen; the further parameters act on the field, whatever brought it
+CROSSING = ("delta", "absorption", "background")
+# test_laws compares the recomputed with the kept one, and the rays of test_ray_solver are cubic
+DEAR = ("rays-cubic-recomputed",)
 PROPAGATIONS = ("projection", "rays", "wave")
 
 
@@ -83,7 +85,9 @@ def step(name, fidelity):
             name,
             fidelity,
             id=f"{name}-{way}",
-            marks=() if way in PROPAGATIONS or name == "delta" or (way, name) in OTHERS else pytest.mark.slow,
+            marks=()
+            if (way in PROPAGATIONS and (way != "rays" or name in CROSSING)) or (name == "delta" and way not in DEAR)
+            else pytest.mark.slow,
         )
         for name in PARAMETERS
         for way, fidelity in FIDELITIES.items()
@@ -106,14 +110,17 @@ def test_gradient_reaches_every_voxel(point, fidelity):
 
 
 @pytest.mark.parametrize(
-    ("name", "bias"),
+    ("propagation", "name", "bias"),
     [
-        ("shear", 0.8),
-        ("bias", 0.0),
-        ("focus", 0.8),
-        ("aberrations", 0.8),
-        ("delta", 0.8),
-        ("absorption", 0.8),
+        pytest.param(
+            propagation,
+            name,
+            0.0 if name == "bias" else 0.8,
+            id=f"{propagation}-{name}-{0.0 if name == 'bias' else 0.8}",
+            marks=pytest.mark.slow if propagation == "rays" and name not in CROSSING else (),
+        )
+        for propagation in PROPAGATIONS
+        for name in ("shear", "bias", "focus", "aberrations", "delta", "absorption")
     ],
 )
 def test_parameter_that_is_zero_keeps_its_gradient(point, propagation, name, bias):
@@ -143,6 +150,7 @@ def test_parameter_that_is_zero_keeps_its_gradient(point, propagation, name, bia
     assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_result_carries_a_graph_only_where_a_tensor_of_the_caller_does(point, propagation):
     assert not compute(point, Fidelity(propagation)).requires_grad
     for name in PARAMETERS:
@@ -160,6 +168,7 @@ def test_parameter_is_learned_and_a_constant_is_not(point):
     assert [name for name, _ in volume.named_parameters()] == ["background"]
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_tensor_keeps_its_graph(point, propagation):
     """delta = f(θ): the chain rule goes through the volume to θ."""
     theta = scalar(0.3).requires_grad_()

@@ -577,7 +577,12 @@ ZERO = ("shear", "bias", "axis", "retardance", "diattenuation")
 
 
 @pytest.mark.parametrize(
-    ("name", "zero"), [*((name, True) for name in ZERO), *((name, False) for name in (*ZERO, "background", "errors"))]
+    ("name", "zero"),
+    [
+        *((name, True) for name in ZERO),
+        *(pytest.param(name, False, marks=pytest.mark.slow) for name in ZERO),
+        *((name, False) for name in ("background", "errors")),
+    ],
 )
 def test_gradient_is_the_central_difference(point, name, zero):
     value = torch.zeros_like(point[name]) if zero else point[name]
@@ -629,6 +634,7 @@ def test_gradient_of_the_specimen_is_the_central_difference(point, propagation):
     assert abs(float(found)) > 1e-2
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_batches_change_no_image_and_no_gradient(point, propagation):
     """Sources one by one and computed again, turned rays among them."""
     delta = point["delta"].requires_grad_()

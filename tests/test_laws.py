@@ -357,6 +357,7 @@ def at(images, grid, places):
     return torch.einsum("...yx,py,px->...p", torch.fft.fft2(images, norm="forward"), *waves).real
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_turning_everything_by_30_degrees_turns_the_image(propagation):
     """Specimen, shear and sources turned together about the optical axis, by an angle that the voxels don't share.
 
@@ -426,9 +427,18 @@ def test_reversing_the_optical_axis_of_a_symmetric_setup_leaves_a_weak_image_mir
 
 
 @pytest.mark.parametrize(
-    ("fine", "tolerance"),
-    [((3, 1, 1), 0.01), ((1, 3, 3), 0.02), pytest.param((3, 3, 3), 0.02, marks=pytest.mark.slow)],
-    ids=str,
+    ("propagation", "fine", "tolerance"),
+    [
+        pytest.param(
+            propagation,
+            fine,
+            tolerance,
+            id=f"{propagation}-{fine}-{tolerance}",
+            marks=pytest.mark.slow if fine == (3, 3, 3) or (propagation == "rays" and fine == (1, 3, 3)) else (),
+        )
+        for propagation in ("projection", "rays", "wave")
+        for fine, tolerance in (((3, 1, 1), 0.01), ((1, 3, 3), 0.02), ((3, 3, 3), 0.02))
+    ],
 )
 def test_index_does_not_depend_on_voxel_size(propagation, fine, tolerance):
     """A third of the voxel size along z, along y and x, or all: the same image at the shared centres.
@@ -459,7 +469,14 @@ def test_index_does_not_depend_on_voxel_size(propagation, fine, tolerance):
 
 
 @pytest.mark.parametrize("shape", SIZES, ids=str)
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+@pytest.mark.parametrize(
+    ("propagation", "interpolation"),
+    [
+        pytest.param(way, interpolation, marks=pytest.mark.slow if (way, interpolation) == ("rays", "linear") else ())
+        for interpolation in ("linear", "cubic")
+        for way in ("projection", "rays", "wave")
+    ],
+)
 def test_any_size_gives_a_finite_image_and_gradient(shape, propagation, interpolation, smooth_field):
     grid = Grid(shape, (0.5, 0.2, 0.21))
     delta = smooth_field(grid, 0.02).requires_grad_()

@@ -62,7 +62,16 @@ SCENES = {
 # kept whole, in batches, and a single source's steps in slabs
 BUDGETS = {"whole": AMPLE, "batches": 2_500_000, "least": 1}
 USUAL = ("projection", "wave-2")
-DEAR = ("rays-cubic", "rays-absorbing", "rays-double", "rays-padded", "projection-map")
+DEAR = (
+    "projection-cubic",
+    "projection-many-images",
+    "rays-cubic",
+    "projection-map",
+    "rays-absorbing",
+    "rays-double",
+    "rays-turned",
+    "rays-padded",
+)
 CASES = [
     pytest.param(
         *scene,

@@ -94,7 +94,14 @@ def test_images_and_gradients_are_those_of_the_whole_array(whole, grid):
 
 @pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 @pytest.mark.parametrize("microscope", MICROSCOPES.values(), ids=MICROSCOPES.keys())
-@pytest.mark.parametrize("grid", [GRIDS["even"], GRIDS["prime"]], ids=["even", "prime"])
+@pytest.mark.parametrize(
+    ("propagation", "grid"),
+    [
+        pytest.param(way, GRIDS[name], id=f"{way}-{name}", marks=pytest.mark.slow if way == "rays" else ())
+        for way in ("projection", "rays", "wave")
+        for name in ("even", "prime")
+    ],
+)
 def test_every_pupil_and_pair_of_beams_is_held(whole, grid, microscope, propagation):
     assert_same(whole(taken(grid, microscope, fidelity=Fidelity(propagation))))
 

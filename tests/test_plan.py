@@ -379,6 +379,7 @@ def strong(contrast, microscope=MICROSCOPE):
     return Scene(volume(Bead(1.2, contrast, 1.36).delta(grid), grid), 0.2, microscope, padding=16)
 
 
+@pytest.mark.slow
 def test_a_specimen_too_strong_for_thick_slabs_is_planned_with_finer_ones():
     scene = strong(0.3)
     for coarse in (Fidelity(steps=8, order=1), Fidelity(order=1), Fidelity(steps=24, order=1)):
@@ -432,6 +433,7 @@ def test_pilots_keep_their_warnings_to_themselves():
 # what an image costs
 
 
+@pytest.mark.slow
 def test_a_camera_does_not_keep_a_strong_specimen_from_being_planned():
     grid = Grid((4, 32, 32), (1.0, 0.2, 0.2))
     microscope = replace(MICROSCOPE, camera=Camera(pixel_size=0.4))
@@ -443,6 +445,7 @@ def test_a_camera_does_not_keep_a_strong_specimen_from_being_planned():
     assert all(math.isfinite(e.error) for e in made.effects)
 
 
+@pytest.mark.slow
 def test_a_pixel_wider_than_the_rays_window_leaves_their_estimates():
     microscope = replace(MICROSCOPE, camera=Camera(pixel_size=7.0))
     ball = gaussian(0.03, 1.2, Grid((10, 80, 80), (0.4, 0.2, 0.2)))
@@ -464,8 +467,8 @@ def test_light_that_straight_rays_cannot_carry_is_planned_for_the_wave():
 
 
 def test_shears_may_be_whole_numbers():
-    ball = GaussianBall(0.6, 0.02, 1.36).delta(Grid((8, 40, 40), (0.4, 0.2, 0.2)))
-    scene = volume(ball, Grid((8, 40, 40), (0.4, 0.2, 0.2)))
+    grid = Grid((4, 24, 24), (0.4, 0.2, 0.2))
+    scene = volume(GaussianBall(0.4, 0.02, 1.36).delta(grid), grid)
     whole, real = (plan(scene, MICROSCOPE, Acquisition([Prism((0, one), 1)], [6]), 0.1) for one in (1, 1.0))
     assert (whole.fidelity, whole.error) == (real.fidelity, real.error)
 
@@ -522,7 +525,8 @@ def test_coherent_light_keeps_its_rings_far_beyond_the_sides():
     assert 0.06 < made.error < 0.12  # 0.074 against 150 voxels of padding
 
 
-@pytest.mark.parametrize("wavelength", [pytest.param(0.55, marks=pytest.mark.slow), 0.6])
+@pytest.mark.slow
+@pytest.mark.parametrize("wavelength", [0.55, 0.6])
 def test_slabs_carry_the_shortest_of_many_colours(wavelength):
     grid = Grid((4, 24, 24), (0.8, 0.12, 0.12))
     bead = volume(Bead(1.0, 0.25, 1.36).delta(grid), grid)
@@ -532,6 +536,7 @@ def test_slabs_carry_the_shortest_of_many_colours(wavelength):
     assert bool(torch.isfinite(image(bead, microscope, acquisition, made.fidelity)).all())
 
 
+@pytest.mark.slow
 def test_a_spectrum_is_left_out_for_light_of_the_nominal_wavelength():
     ball = gaussian(0.02, 0.6)
     microscope = Microscope(0.5, Objective(0.6), Condenser(0.3), spectrum=Spectrum([0.5, 0.6, 0.61], [0, 1, 1]))
@@ -582,6 +587,7 @@ def test_a_tolerance_is_above_0_and_finite(tolerance):
         plan(coherent().volume, MICROSCOPE, ACQUISITION, tolerance)
 
 
+@pytest.mark.slow
 def test_a_window_of_layers_has_no_edges_of_its_own():
     """Layers wider than a pilot's window scatter nothing, so that one source and one slab do."""
     grid = Grid((8, 96, 90), (0.4, 0.2, 0.2))
@@ -619,7 +625,6 @@ CONFIG = {
 
 
 ADAM = {"method": "adam", "steps": 12, "checkpoint_every": 2, "start": "zero", "learning_rate": 2e-3, "tv": [60.0, 5.0]}
-METHODS = pytest.mark.parametrize("recipe", [CONFIG["reconstruction"], ADAM], ids=["newton", "adam"])
 
 
 @pytest.fixture
@@ -678,7 +683,9 @@ def test_bad_input_is_one_line_and_exit_code_2(write, tmp_path, capsys, command,
     assert not (tmp_path / "out").exists()
 
 
-@METHODS
+@pytest.mark.parametrize(
+    "recipe", [CONFIG["reconstruction"], pytest.param(ADAM, marks=pytest.mark.slow)], ids=["newton", "adam"]
+)
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_path, capsys, recipe):
@@ -701,7 +708,9 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
-@METHODS
+@pytest.mark.parametrize(
+    "recipe", [pytest.param(CONFIG["reconstruction"], marks=pytest.mark.slow), ADAM], ids=["newton", "adam"]
+)
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
 def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch, recipe):

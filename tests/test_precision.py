@@ -86,7 +86,7 @@ def test_candidate_equal_to_the_reference_has_no_numerical_error(volume, propaga
     assert (trial.model_gradient_error == 0) == (propagation == "wave")
 
 
-@pytest.mark.parametrize(("order", "steps"), [(1, (48, 96, 192)), (2, (6, 12, 24))])
+@pytest.mark.parametrize(("order", "steps"), [pytest.param(1, (48, 96, 192), marks=pytest.mark.slow), (2, (6, 12, 24))])
 def test_error_of_the_wave_falls_with_the_order_of_its_steps(smooth_field, order, steps):
     """The error of n steps is C·n^−order where slabs sample the volume alike (it is uniform along z).
 
@@ -139,6 +139,7 @@ def test_gradient_is_that_of_finite_differences(volume):
     assert gradient_error(other, gradient) == pytest.approx(trial.numerical_gradient_error, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_numerical_and_model_errors_are_kept_apart():
     """Straight rays converge to their own answer, which is not that of the exact field; the wave's is."""
     ball, grid = GaussianBall(0.8, 0.05, N0), Grid((24, 40, 40), (0.25, 0.16, 0.16))
@@ -157,14 +158,21 @@ def test_numerical_and_model_errors_are_kept_apart():
     assert against_wave.model_error != found[0].model_error
 
 
-def test_model_options_are_the_candidate_s_own_in_its_converged_answer(volume):
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"amplitude": False},
+        pytest.param({"defocus": "paraxial"}, marks=pytest.mark.slow),
+        pytest.param({"amplitude": False, "object_aberration": "linear"}, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_model_options_are_the_candidate_s_own_in_its_converged_answer(volume, options):
     """Rays without amplitude, or with paraxial defocus, are other models: they converge to answers of their own."""
     reference = Fidelity("wave", steps=4, sources=4)
-    options = ({"amplitude": False}, {"defocus": "paraxial"}, {"amplitude": False, "object_aberration": "linear"})
-    candidates = [Fidelity("rays", steps=4, sources=4, **option) for option in options]
-    for trial in measured(volume, *candidates, reference=reference):
-        assert trial.numerical_error == 0
-        assert trial.model_error > 1e-3
+    (trial,) = measured(volume, Fidelity("rays", steps=4, sources=4, **options), reference=reference)
+    assert trial.numerical_error == 0
+    assert trial.model_error > 1e-3
 
 
 def test_scene_s_absorption_and_learned_volume_take_part(volume):
@@ -382,7 +390,7 @@ def test_preset_errs_by_what_it_says(benchmark, truth, name, preset):
     assert error / 1.2 < image_error(images, truth(name)) < 1.2 * error
 
 
-@pytest.mark.parametrize("preset", ["DRAFT", "STANDARD", "REFERENCE"])
+@pytest.mark.parametrize("preset", ["DRAFT", "STANDARD", pytest.param("REFERENCE", marks=pytest.mark.slow)])
 def test_presets_leave_an_empty_volume_empty(benchmark, preset):
     scene = benchmark.SCENES["empty"]
     with torch.no_grad():

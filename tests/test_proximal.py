@@ -115,8 +115,15 @@ MAJORANTS = {
 }
 
 
-@pytest.mark.parametrize("majorant", MAJORANTS.values(), ids=MAJORANTS)
-@pytest.mark.parametrize("bounds", [FREE, Bounds()], ids=["free", "not below 0"])
+@pytest.mark.parametrize(
+    ("bounds", "majorant"),
+    [
+        pytest.param(bounds, majorant, id=f"{limits}-{name}", marks=() if (limits, name) in fast else pytest.mark.slow)
+        for fast in [{("free", "edges"), ("not below 0", "everything")}]
+        for limits, bounds in (("free", FREE), ("not below 0", Bounds()))
+        for name, majorant in MAJORANTS.items()
+    ],
+)
 def test_a_warm_start_is_within_one_per_cent_of_a_long_run(noisy, majorant, bounds):
     """As a descent has it: what is sought moves a little from one model to the next."""
     long_, _ = solved(noisy, majorant, bounds=bounds, times=100)

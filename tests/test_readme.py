@@ -38,14 +38,26 @@ def test_the_simulation_writes_the_stack_that_the_configuration_reads(folder):
     assert data.std() > 0.01
 
 
-def test_the_further_tables_go_into_the_configuration_and_are_simulated(tmp_path):
+@pytest.fixture
+def more(tmp_path) -> Path:
+    """The README's configuration with its further tables."""
     path = tmp_path / "more.toml"
     path.write_text("".join(blocks("toml")), encoding="utf-8")
-    config = load(path)
+    return path
+
+
+def test_the_further_tables_go_into_the_configuration(more):
+    config = load(more)
     assert config.microscope.polarisation.pupil.strained
     assert config.microscope.polarisation.pupil.depolarisation
     assert (config.fidelity.object_aberration, config.fidelity.defocus) == ("cone", "paraxial")
-    assert main(["simulate", str(path), "--out", str(tmp_path / "out")]) == 0
+    assert config.specimen is not None
+    assert config.specimen["kind"] == "cell"
+
+
+@pytest.mark.slow
+def test_the_further_tables_are_simulated(more, tmp_path):
+    assert main(["simulate", str(more), "--out", str(tmp_path / "out")]) == 0
     stack = read_stack(tmp_path / "out" / "stack.ome.tif").data
     assert stack.shape == (2, 3, 64, 72)
     assert stack.std() > 0.01

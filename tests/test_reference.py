@@ -64,7 +64,7 @@ def test_bright_field_of_an_object_that_reaches_the_pupils_edge_takes_more_direc
     assert many == pytest.approx(1.2e-4, rel=0.2)
 
 
-@pytest.mark.parametrize("specimen", ["gauss", "asym"])
+@pytest.mark.parametrize("specimen", [pytest.param("gauss", marks=pytest.mark.slow), "asym"])
 def test_thin_object_agrees_in_every_plane_with_the_reference_implementations_paraxial_defocus(load, specimen):
     data = load("thin_dic")
     dic, bright = thin(data, specimen, list(range(7)), "paraxial")
@@ -111,7 +111,7 @@ def setup(data):
         pytest.param(Fidelity("rays"), 0.0025, marks=pytest.mark.slow),
         pytest.param(Fidelity("rays", interpolation="cubic", steps=24), 0.002, marks=pytest.mark.slow),
         (Fidelity("wave"), 0.002),
-        (Fidelity("wave", order=1), 0.005),
+        pytest.param(Fidelity("wave", order=1), 0.005, marks=pytest.mark.slow),
     ],
     ids=["rays-in-24-steps", "rays", "rays-cubic", "wave", "wave-first-order"],
 )
@@ -129,12 +129,14 @@ def test_smooth_ball_agrees_with_the_exact_field(load, fidelity, tolerance):
     assert float(error.max()) < tolerance, error
 
 
+# test_exact_fields holds a smaller bead to the same
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fidelity", "tolerance", "floor"),
     [
         (Fidelity("wave"), 0.03, 0.0),
-        pytest.param(Fidelity("projection"), 1.0, 0.1, marks=pytest.mark.slow),
-        pytest.param(Fidelity("rays", steps=48), 1.0, 0.1, marks=pytest.mark.slow),
+        (Fidelity("projection"), 1.0, 0.1),
+        (Fidelity("rays", steps=48), 1.0, 0.1),
     ],
     ids=["wave", "projection", "rays"],
 )

@@ -84,6 +84,10 @@ def method(request):
     return request.param
 
 
+NEWTON_SLOW = pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
+
+
+@pytest.mark.slow
 def test_a_bias_that_is_10_degrees_off_is_found_beside_the_volume(data, truth):
     *_, right = minimise(problem(data, TRUE))
     *_, wrong = minimise(problem(data, DECLARED))
@@ -114,6 +118,7 @@ def test_a_descent_of_two_unknowns_goes_on_from_disk_bit_for_bit(data, tmp_path)
         assert all(alike(a, b) for a, b in zip(rest, steps[step.number :], strict=True))
 
 
+@NEWTON_SLOW
 def test_a_problem_can_be_solved_again(data, method):
     two = problem(data, DECLARED, Bias(), steps=4, method=method)
     assert all(alike(a, b) for a, b in zip(minimise(two), minimise(two), strict=True))
@@ -216,12 +221,13 @@ DRIFT = torch.tensor([[[0.1, -0.06], [-0.04, 0.1], [-0.08, 0.0]], [[0.06, 0.05],
 NUISANCES = [Bias(), Brightness(), Drift(), FocusErrors(), ShearError()]
 
 
+@NEWTON_SLOW
 def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth, method):
     known = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, BRIGHTNESS, DRIFT)
     with torch.no_grad():
         data = known.images(FIDELITY)
     *_, wrong = minimise(problem(data, DECLARED, method=method))
-    *_, learned = minimise(problem(data, DECLARED, Bias(), Brightness(), Drift(), steps=80, method=method))
+    *_, learned = minimise(problem(data, DECLARED, Bias(), Brightness(), Drift(), steps=60, method=method))
     assert learned.misfit < 0.2 * wrong.misfit
     assert volume_error(learned.delta, truth) < 0.5 * volume_error(wrong.delta, truth)
     assert float((learned.values["bias"] - torch.tensor([1.5, -1.2])).abs().max()) < 0.25 * OFF
@@ -229,6 +235,7 @@ def test_bias_brightness_and_drift_are_learned_beside_the_volume(truth, method):
     assert learned.values["brightness"].shape == (2, 3)
 
 
+@NEWTON_SLOW
 def test_a_descent_of_everything_goes_on_from_disk_bit_for_bit(data, tmp_path, method):
     everything = problem(data, DECLARED, *NUISANCES, steps=11 if method == "newton" else 6, method=method)
     steps = list(minimise(everything))
@@ -251,6 +258,7 @@ def test_adams_first_step_is_as_long_as_the_nuisances_rate(unknown, data, truth)
     assert float(moved.max()) == pytest.approx(unknown.learning_rate, rel=1e-3)
 
 
+@NEWTON_SLOW
 def test_a_volume_with_a_margin_descends(truth, method):
     """Data of the middle of the true volume; the wide one explains them, beside a drift."""
     wide = Setup(Volume(GRID, truth, BACKGROUND), MICROSCOPE, TRUE, drift=DRIFT, margin=2)
@@ -279,6 +287,7 @@ def test_room_is_found_for_what_drift_and_brightness_hold(data):
     assert held["bias"] == pytest.approx(without, abs=4096)
 
 
+@NEWTON_SLOW
 def test_the_sample_of_a_descent_holds_what_its_later_steps_hold(truth, method):
     """The room is measured on few pixels and in few steps; here it is held to all of a longer descent."""
     grid, fidelity = Grid((5, 48, 44), (0.5, 0.2, 0.21)), Fidelity(sources=1, padding=2)
@@ -306,6 +315,7 @@ def test_the_sample_of_a_descent_holds_what_its_later_steps_hold(truth, method):
     assert whole < _ample(made)
 
 
+@NEWTON_SLOW
 def test_room_is_found_for_a_problem_with_a_margin(data, method):
     made = problem(data, TRUE, method=method)
     setup = replace(made.setup, volume=empty_medium(GRID.widened(3, 3), BACKGROUND, data), margin=3)

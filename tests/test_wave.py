@@ -79,10 +79,27 @@ def test_sources_of_a_ring_share_their_screens(smooth_field):
         torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-12 * float(other.abs().max()))
 
 
-@pytest.mark.parametrize("in_cache", [1, 1 << 20], ids=["source by source", "at once"])
-@pytest.mark.parametrize("screens", [None, [3], [1, 2]], ids=str)
-@pytest.mark.parametrize("absorbs", [False, True])
-@pytest.mark.parametrize("order", [1, 2])
+# a screen for each source, for all or for some; together and one by one; without absorption and with
+VARIANTS = [(False, [1, 2], "source by source"), (True, None, "at once"), (True, [3], "source by source")]
+
+
+@pytest.mark.parametrize(
+    ("order", "absorbs", "screens", "in_cache"),
+    [
+        pytest.param(
+            order,
+            absorbs,
+            screens,
+            1 if name == "source by source" else 1 << 20,
+            id=f"{order}-{absorbs}-{screens}-{name}",
+            marks=() if (absorbs, screens, name) in VARIANTS else pytest.mark.slow,
+        )
+        for order in (1, 2)
+        for absorbs in (False, True)
+        for screens in (None, [3], [1, 2])
+        for name in ("source by source", "at once")
+    ],
+)
 def test_derivative_of_a_slab_is_the_central_difference(monkeypatch, order, absorbs, screens, in_cache):
     """In each of its variables, whatever the parts in which sources are taken."""
     monkeypatch.setattr(batches, "IN_CACHE", in_cache)

@@ -234,7 +234,8 @@ def test_transfer_function_carries_gradients(small):
         return T.real, T.imag
 
     values = tuple(v.requires_grad_() for v in (bias, focus, aberration, n0))
-    assert torch.autograd.gradcheck(strength, values)
+    # along a random direction of what it gives, for each number
+    assert torch.autograd.gradcheck(strength, values, fast_mode=True)
 
 
 def test_dtype_follows_the_background(small, microscope):
