@@ -414,7 +414,14 @@ PUPILS = {
 }
 
 
-@pytest.mark.parametrize(("polarisation", "states", "turns"), PUPILS.values(), ids=PUPILS.keys())
+@pytest.mark.parametrize(
+    ("propagation", "polarisation", "states", "turns"),
+    [
+        pytest.param(way, *case, id=f"{way}-{name}", marks=() if way != "rays" or case[2] else pytest.mark.slow)
+        for way in ("projection", "rays", "wave")
+        for name, case in PUPILS.items()
+    ],
+)
 def test_pupil_of_matrices_takes_a_field_for_each_state_of_the_light(
     delta, counted, monkeypatch, propagation, polarisation, states, turns
 ):
@@ -473,6 +480,7 @@ def test_pupil_is_cut_only_by_an_objective(delta, counted, monkeypatch):
     assert float((without() - with_()).abs().max()) > 1e-4
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_each_colour_is_an_image_of_its_own(delta, counted, propagation):
     """Three times the work, one after the other: no more bytes at once than the images of the other two."""
     plain = taking(delta, propagation=propagation)
@@ -484,6 +492,7 @@ def test_each_colour_is_an_image_of_its_own(delta, counted, propagation):
     )
 
 
+@pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=pytest.mark.slow), "wave"])
 def test_padding_takes_area_and_no_further_call(delta, counted, propagation):
     plain, padded = (taking(delta, propagation=propagation, padding=pad) for pad in (0, 6))
     assert counted(plain) == counted(padded)

@@ -348,6 +348,7 @@ def test_resuming_from_any_step_ends_where_an_uninterrupted_run_does(truth, reci
         assert all(alike(a, b) for a, b in zip(rest, steps[k + 1 :], strict=True))
 
 
+@pytest.mark.slow
 def test_newton_ends_by_itself_and_does_not_go_on_afterwards(truth):
     data = seen(truth) + 0.01 * torch.randn(2, 3, 16, 14)
     recipe = dataclasses.replace(NEWTON, steps=200)
@@ -376,6 +377,7 @@ def test_resuming_counts_the_seconds_on(truth, recipe):
     assert run(seen(truth), recipe, resume=late)[0].seconds > 1000
 
 
+@NEWTON_SLOW
 def test_resuming_leaves_the_step_that_it_went_on_from_alone(truth, recipe):
     steps = run(seen(truth), recipe)
     before = copy.deepcopy(steps[4])

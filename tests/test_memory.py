@@ -71,6 +71,7 @@ DEAR = (
     "rays-double",
     "rays-turned",
     "rays-padded",
+    "wave-leaky",
 )
 CASES = [
     pytest.param(

@@ -120,7 +120,7 @@ def test_it_converges_on_weak_and_on_strong_beads(height):
 @pytest.mark.parametrize(
     ("prior", "height"),
     [
-        ("log-tv", 0.1),
+        pytest.param("log-tv", 0.1, marks=SLOW),
         ("tv", 0.1),
         ("smooth", 0.02),
         *(pytest.param(*case, marks=SLOW) for case in (("log-tv", 0.02), ("tv", 0.02), ("smooth", 0.1))),

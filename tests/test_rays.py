@@ -456,7 +456,7 @@ def test_no_steps_means_one_per_slice_and_others_are_as_said(smooth_field):
         {"memory": 1},
         {"interpolation": "cubic"},
         {"solver": "dopri5"},
-        {"solver": "bosh3", "interpolation": "cubic"},
+        pytest.param({"solver": "bosh3", "interpolation": "cubic"}, marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -303,6 +303,7 @@ def test_without_a_fidelity_the_recommended_wave_is_used_and_recorded(workplace,
     ],
     ids=["one image", "bright field"],
 )
+@pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
 def test_any_acquisition_goes_from_specimen_to_volume(other, tmp_path, acquisition, method):
     path = other(
         {
