@@ -181,6 +181,7 @@ def test_defocus_and_object_aberration_are_read_and_dumped(write, tmp_path, meth
         ("reconstruction.draft_sources", 12, 12),
         ("reconstruction.method", "opl", "opl"),
         ("data.gain", 0.5, 0.5),
+        ("data.series", 2, 2),
     ],
 )
 def test_a_value_is_read_and_survives_its_file(write, tmp_path, key, value, read):
@@ -418,6 +419,7 @@ def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, nam
         ("data.scale", -1, ["data", "scale -1", "above 0"]),
         ("data.offset", math.nan, ["data", "offset nan", "finite"]),
         ("data.order", -1, ["data", "order -1", "at least 0"]),
+        ("data.series", -1, ["data", "series -1", "at least 0"]),
     ],
 )
 def test_an_unphysical_value_is_named_with_its_law(write, key, value, words):

@@ -89,6 +89,7 @@ class DataSection:
     """The measured stack, and how it is brought to the model's unit; see `recon.recording.preparation.prepare`.
 
     path: of the stack; a relative one starts from the configuration's folder.
+    series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     flatten: whether each image is divided by its background; None does so for integer stacks only.
     scale: counts of an empty bright field, or "background" to find them from the images' background; None does so for
         integer stacks, and takes floats as relative to the empty bright field.
@@ -96,11 +97,12 @@ class DataSection:
     order: of the polynomial in (y, x) that is fitted to a background.
     gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
         None is one noise for each prism, as it was measured.
-    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite and an order
-    below 0.
+    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
+    or a series below 0.
     """
 
     path: str
+    series: int | None = None
     flatten: bool | None = None
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
@@ -119,6 +121,8 @@ class DataSection:
             raise ValueError(f"offset {self.offset} must be finite")
         if self.order < 0:
             raise ValueError(f"order {self.order} must be at least 0")
+        if self.series is not None and self.series < 0:
+            raise ValueError(f"series {self.series} must be at least 0; the first is 0")
 
 
 @dataclass(frozen=True)
