@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
 from recon.config.schema import ConfigError
+from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
 from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
@@ -63,6 +64,7 @@ def main(typed: Sequence[str] | None = None) -> int:
     typed: the words after `torchdic`; None takes them from the command line.
     Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
     """
+    write_plainly()
     options = _parser().parse_args(typed)
     _show_each_warning_once()
     try:
