@@ -111,6 +111,7 @@ SPECIMEN = {"kind": "bead", "radius": 2.5, "contrast": 0.03}
         ("volume/spacing", [4e-7, 1.6e-7, 1.6e-7], "volume.spacing[1]: 1.6e-07 µm", "1.6e-07 m are 0.16 µm"),
         ("volume/spacing", [0.4, 1.6e-4, 1.6e-4], "volume.spacing[1]: 0.00016 µm", "0.00016 mm are 0.16 µm"),
         ("acquisition/focus", [-2000, 0, 2000], "acquisition.focus[0]: -2000 µm", "-2000 nm are -2 µm"),
+        ("acquisition/focus", [-200, 0, 200], "acquisition.focus[0]: -200 µm", "-200 nm are -0.2 µm"),
         ("acquisition/focus", [-2e-6, 0, 2e-6], "acquisition.focus[0]: -2e-06 µm", "-2e-06 m are -2 µm"),
         ("acquisition/prisms/0/shear", [0, 240], "acquisition.prisms[0].shear[1]: 240 µm", "240 nm are 0.24 µm"),
         ("acquisition/prisms/0/shear", [0, 2.4e-7], "prisms[0].shear[1]: 2.4e-07 µm", "2.4e-07 m are 0.24 µm"),
@@ -158,7 +159,7 @@ def test_a_value_in_another_unit_is_named_with_its_key_and_with_the_value_in_the
         ("microscope/wavelength", 10.6),
         ("volume/spacing", [50.0, 6.5, 6.5]),
         ("acquisition/focus", [0.0]),
-        ("acquisition/focus", [-100.0, 1e-5]),
+        ("acquisition/focus", [-60.0, 1e-5]),
         ("acquisition/prisms/0/shear", [0.24, 1.5e-17]),
         ("acquisition/prisms/0/shear", [0, 0]),
         ("acquisition/prisms/0/bias", 6.2832),
@@ -170,6 +171,15 @@ def test_a_value_in_another_unit_is_named_with_its_key_and_with_the_value_in_the
 )
 def test_what_may_be_right_is_allowed(key, value):
     assert wrong_unit(changed(key, value)) is None
+
+
+def test_a_low_aperture_is_focused_far_away():
+    values = changed("acquisition/focus", [-500, 500])
+    assert wrong_unit(values) is not None
+    values["microscope"]["objective"]["na"] = 0.1
+    assert wrong_unit(values) is None
+    del values["microscope"]["objective"]  # nothing tells how deep the field is
+    assert wrong_unit(values) is None
 
 
 @pytest.mark.parametrize("value", [0, -0.546, float("nan"), float("inf"), "546", True, None, [], {}])

@@ -14,8 +14,10 @@ from recon.config.schema import ConfigError
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
+from recon.run.results import ResultsError
 from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -69,7 +71,7 @@ def main(typed: Sequence[str] | None = None) -> int:
     _show_each_warning_once()
     try:
         options.run(options)
-    except (ConfigError, StackError, CheckpointError) as error:
+    except (ConfigError, StackError, CheckpointError, ResultsError, WriteError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)

@@ -12,7 +12,7 @@ _LENGTHS = {"nm": 1e-3, "m": 1e6, "mm": 1e3}
 # A rounded full turn is still one.
 _TURN = 6.29
 
-# A specimen that is larger than the volume by this factor isn't in it.
+# A specimen that is larger than the volume by this factor isn't in it, nor is a focus that is as far away.
 _BEYOND = 10
 
 
@@ -67,7 +67,6 @@ _QUANTITIES = (
     ),
     _Plausible(r"volume\.spacing", "size of a voxel", 1e-3, 100, each=True),
     _Plausible(r"microscope\.camera\.pixel_size", "size of a pixel", 1e-3, 100),
-    _Plausible(r"acquisition\.focus", "focus", 1e-4, 250),
     _Plausible(rf"{_PRISM}shear", "shear", 1e-4, 20),
     _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
     _Plausible(rf"{_PRISM}offset", "offset of a prism", 1e-4, 1e5),
@@ -96,8 +95,9 @@ def wrong_unit(values: dict[str, Any]) -> str | None:
 
     values: of a configuration file, as TOML holds them. Values of a wrong type are passed over.
     """
-    quantities = (*_QUANTITIES, *_of_the_specimen(values))
-    for key, numbers in _numbers(values):
+    known = dict(_numbers(values))
+    quantities = (*_QUANTITIES, _focus(known), *_of_the_specimen(known))
+    for key, numbers in known.items():
         if key == "volume.spacing":
             lateral = {place: number for place, number in numbers.items() if place in ("[1]", "[2]")}
             if lateral and (problem := _LATERAL.problem(key, lateral)):
@@ -108,14 +108,28 @@ def wrong_unit(values: dict[str, Any]) -> str | None:
     return None
 
 
-def _of_the_specimen(values: dict[str, Any]) -> list[_Plausible]:
+def _focus(known: dict[str, dict[str, float]]) -> _Plausible:
+    """How far a focus may lie from the centre: not many times the volume's depth or the depth of field."""
+    wavelength, aperture = (known.get(f"microscope.{name}", {}).get("", 0) for name in ("wavelength", "objective.na"))
+    field = wavelength / aperture**2 if wavelength > 0 and aperture > 0 else math.inf
+    furthest = max(_BEYOND * max(_extent(known)[:1], default=0), 2 * _BEYOND * field, 50)
+    return _Plausible(r"acquisition\.focus", "focus in this volume", 1e-4, min(furthest, 1e4))
+
+
+def _of_the_specimen(known: dict[str, dict[str, float]]) -> list[_Plausible]:
     """How large a specimen may be: it lies in the volume. An empty list where the volume isn't one."""
-    volume = dict(_numbers({"volume": values.get("volume")}))
-    shape, spacing = (volume.get(f"volume.{name}", {}) for name in ("shape", "spacing"))
+    extent = _extent(known)
+    if not extent:
+        return []
+    return [_Plausible(_OF_SPECIMENS, "length of a specimen in this volume", 1e-4, max(_BEYOND * max(extent), 50))]
+
+
+def _extent(known: dict[str, dict[str, float]]) -> list[float]:
+    """The volume's size (z, y, x) in µm; an empty list where it has none."""
+    shape, spacing = (known.get(f"volume.{name}", {}) for name in ("shape", "spacing"))
     if len(shape) != 3 or len(spacing) != 3:
         return []
-    extent = max(n * d for n, d in zip(shape.values(), spacing.values(), strict=True))
-    return [_Plausible(_OF_SPECIMENS, "length of a specimen in this volume", 1e-4, max(_BEYOND * extent, 50))]
+    return [n * d for n, d in zip(shape.values(), spacing.values(), strict=True)]
 
 
 def _numbers(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.tiff import TIFF
-from torchdic.files.whole import written_whole
+from torchdic.files.whole import WriteError, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
@@ -158,8 +158,8 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
     try:
         with written_whole(path) as partial:
             known.write(partial, stack, compression)
-    except OSError as error:
-        raise StackError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except WriteError as error:
+        raise StackError(str(error)) from error
 
 
 def _check_openable(path: Path) -> None:
