@@ -90,6 +90,14 @@ def test_a_page_of_many_that_is_cut_off_is_refused(tmp_path):
     assert "truncated" in the_error(path)
 
 
+def test_pages_of_colour_are_refused_as_such(tmp_path):
+    path = tmp_path / "stack.tif"
+    with tifffile.TiffWriter(path) as tif:
+        for plane in PLANES:
+            tif.write(np.stack([plane] * 3, -1), photometric="rgb")
+    assert "is a colour image, 3 samples per pixel" in the_error(path)
+
+
 # --- several stacks in one file ---------------------------------------------------------------------------------------
 
 
@@ -137,6 +145,17 @@ def test_single_images_at_several_places_of_the_stage_are_no_focus_planes(tmp_pa
             tif.write(plane, photometric="minisblack", metadata=meta)
     assert "5 equal series" in the_error(path)
     assert np.array_equal(read_stack(path, 3).data[0, 0], PLANES[3])
+
+
+def test_single_images_with_labels_of_the_stage_are_no_focus_planes(tmp_path):
+    path = tmp_path / "places.ome.tif"
+    in_a_loop(path, ome=True)
+    with tifffile.TiffFile(path) as tif:
+        xml = tif.ome_metadata
+    numbers = iter(range(5))
+    labelled = re.sub("<Pixels ", lambda found: f'<StageLabel Name="Pos{next(numbers)}"/>{found[0]}', xml)
+    tifffile.tiffcomment(path, labelled.encode())
+    assert "5 equal series" in the_error(path)
 
 
 def test_a_file_of_one_stack_has_the_series_0(tmp_path):
@@ -284,3 +303,11 @@ def test_a_stack_is_written_with_its_axes_and_never_transposed(tmp_path, name, s
     assert np.array_equal(read_stack(path).data, data.reshape((1,) * (4 - data.ndim) + shape))
     with tifffile.TiffFile(path) as tif:
         assert 'DimensionOrder="XYZCT"' in tif.ome_metadata
+
+
+def test_axes_that_tifffile_chose_are_told_where_nothing_else_would_show_it(tmp_path):
+    path = tmp_path / "x.ome.tif"
+    data = np.arange(2 * 2 * 9 * 7, dtype=np.float32).reshape(2, 2, 9, 7)
+    tifffile.imwrite(path, data, photometric="minisblack")
+    with pytest.warns(StackWarning, match=r"Z \(2\) is taken as the focus and C \(2\) as the prism"):
+        assert np.array_equal(read_stack(path).data, data.transpose(1, 0, 2, 3))

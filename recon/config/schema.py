@@ -89,7 +89,6 @@ class DataSection:
     """The measured stack, and how it is brought to the model's unit; see `recon.recording.preparation.prepare`.
 
     path: of the stack; a relative one starts from the configuration's folder.
-    series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     flatten: whether each image is divided by its background; None does so for integer stacks only.
     scale: counts of an empty bright field, or "background" to find them from the images' background; None does so for
         integer stacks, and takes floats as relative to the empty bright field.
@@ -97,18 +96,19 @@ class DataSection:
     order: of the polynomial in (y, x) that is fitted to a background.
     gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
         None is one noise for each prism, as it was measured.
+    series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
     or a series below 0.
     """
 
     path: str
-    series: int | None = None
     flatten: bool | None = None
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
     order: int = 2
     gain: float | None = None
     read_noise: float = 0.0
+    series: int | None = None
 
     def __post_init__(self) -> None:
         if self.gain is not None and not (0 < self.gain < math.inf):

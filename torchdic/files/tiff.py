@@ -73,6 +73,7 @@ def _described(tif: tifffile.TiffFile, path: Path, number: int) -> tuple[ome.Siz
     if tif.is_ome:
         root = ome.parsed(tif, path)
         ome.find_planes(tif, root, path)
+        ome.warn_of_guessed_axes(root, path)
         return *ome.sizes_and_names(root, path, number), ome.has_places(root)
     return imagej_sizes(tif, path) if tif.is_imagej else (None, None, None), (), False
 

@@ -7,6 +7,7 @@ import tifffile
 
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import place_axis
+from torchdic.files.arrangement.grey import check_grey
 from torchdic.files.format import shape_text
 
 Page = tifffile.TiffPage | tifffile.TiffFrame
@@ -21,13 +22,16 @@ def chosen_series(
     """The series that was asked for, and the index along its axis of places, None where it has none or none is chosen.
 
     number: of the series, counted from 0; None where the file has only one.
-    Raises StackError where there are more than one and none is chosen, or where there is none of that number.
+    Raises StackError where there are more than one and none is chosen, where there is none of that number, and for
+    several colour images.
     """
     series = tif.series
     if not series:
         raise StackError(f"{path}: holds no images")
     if number is None:
         if len(series) > 1:
+            if all(s.keyframe.samplesperpixel > 1 for s in series):
+                check_grey(series[0].keyframe, path)
             raise StackError(f"{path}: {_described(series)}; a stack is one series: {_offer(len(series))}")
         return series[0], None
     place = place_axis(tuple(series[0].get_shape(squeeze=False)), series[0].get_axes(squeeze=False))

@@ -1,11 +1,12 @@
 """OME-XML: sizes, the prisms' names, and in which files the planes lie."""
 
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
 import tifffile
 
-from torchdic.errors import StackError
+from torchdic.errors import StackError, StackWarning
 from torchdic.files.described.units import micrometres
 from torchdic.files.tiff_structure import check_pages
 
@@ -41,11 +42,32 @@ def sizes_and_names(root: ElementTree.Element, path: Path, series: int = 0) -> t
     return (z, y, x), names if any(names) else ()
 
 
+def warn_of_guessed_axes(root: ElementTree.Element, path: Path) -> None:
+    """Warn StackWarning where the axes of a stack with as many prisms as planes may be no one's choice.
+
+    tifffile names the axes of an array (Z, C, y, x) where its user names none. A stack of (prism, focus, y, x) that was
+    written so is transposed, and nothing else can tell.
+    """
+    pixels = root.find(".//{*}Image/{*}Pixels")
+    if pixels is None or not root.get("Creator", "").startswith("tifffile"):
+        return
+    planes, prisms = pixels.get("SizeZ"), pixels.get("SizeC")
+    if pixels.get("DimensionOrder") == "XYCZT" and planes == prisms != "1":
+        warnings.warn(
+            f"{path}: its axes are Z, C, y, x, as tifffile writes them where none are named: Z ({planes}) is taken as the "
+            f"focus and C ({prisms}) as the prism; metadata={{'axes': 'CZYX'}} writes them the other way round",
+            StackWarning,
+            stacklevel=4,
+        )
+
+
 def has_places(root: ElementTree.Element) -> bool:
     """Whether the images were recorded at more than one place of the stage."""
-    planes = [image.find("{*}Pixels/{*}Plane") for image in root.findall("{*}Image")]
+    images = root.findall("{*}Image")
+    planes = [image.find("{*}Pixels/{*}Plane") for image in images]
     places = {(plane.get("PositionX"), plane.get("PositionY")) for plane in planes if plane is not None}
-    return len(places) > 1
+    labels = {label.get("Name") for label in (image.find("{*}StageLabel") for image in images) if label is not None}
+    return len(places) > 1 or len(labels) > 1
 
 
 def find_planes(tif: tifffile.TiffFile, root: ElementTree.Element, path: Path) -> None:
@@ -77,4 +99,6 @@ def find_planes(tif: tifffile.TiffFile, root: ElementTree.Element, path: Path) -
 
 def _is_own(part: ElementTree.Element, own: str | None, name: str) -> bool:
     """Whether a plane lies in the file whose identity (None where it has none) and name are given."""
-    return part.text == own if own else part.get("FileName", name).lower() == name.lower()
+    if own and part.text:
+        return part.text.strip().lower() == own.strip().lower()
+    return part.get("FileName", name).lower() == name.lower()
