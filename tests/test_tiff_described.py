@@ -244,8 +244,17 @@ def test_a_stated_bit_depth_is_found(tmp_path, write):
 
 def test_a_stated_depth_that_the_pixels_exceed_is_passed_over(tmp_path):
     stack = read_stack(ome(tmp_path / "stack.ome.tif", 'SignificantBits="8"', clipped(12, 3)[0]))
-    assert stack.bits == 16
+    assert stack.bits is None
     assert stack.saturation == 2**15 - 8
+
+
+def test_the_depth_of_the_pixels_themselves_tells_nothing(tmp_path):
+    """Programs write it for any camera; who gives it in code means it."""
+    data = clipped(12)[0]
+    stack = read_stack(ome(tmp_path / "stack.ome.tif", 'SignificantBits="16"', data))
+    assert stack.bits is None
+    assert stack.saturation == 4095
+    assert Stack(data[None], bits=16).saturation == 65535
 
 
 @pytest.mark.parametrize("shift", [0, 4])

@@ -10,11 +10,11 @@ def full_scale(data: np.ndarray, bits: int | None = None) -> int:
     """The largest value that the camera behind integer pixels can give.
 
     data: integers of any shape, not empty.
-    bits: the camera's bit depth as the file states it; None where it does not. A depth that the pixels exceed is passed
-        over: it is wrong, or they are left-aligned, as those of 12 bits that were multiplied by 16.
+    bits: the camera's bit depth; None where it isn't known. A depth that the pixels exceed is passed over: it is wrong,
+        or they are left-aligned, as those of 12 bits that were multiplied by 16.
     """
-    size, top = 8 * data.dtype.itemsize, int(data.max())
-    if bits is not None and 0 < bits < size and top < 2**bits:
+    size, top = int(np.iinfo(data.dtype).max).bit_length(), int(data.max())
+    if bits is not None and 0 < bits <= size and top < 2**bits:
         return 2**bits - 1
     if int(data.min()) >= 0 and top > 0:
         empty = _empty_low_bits(data)

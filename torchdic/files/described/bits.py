@@ -16,7 +16,7 @@ _MICRO_MANAGER = 51123  # the tag that holds the metadata of a page
 
 
 def stated_bits(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[int]:
-    """All bit depths that the file states, smallest first; programs disagree where one means the pixel's own size."""
+    """All bit depths that the file states, smallest first, below that of the pixels themselves, which tells nothing."""
     found = [page.bitspersample] if isinstance(page.bitspersample, int) else []
     for text in _texts(tif, page):
         found += [int(bits) for bits in _STATED.findall(text)]
@@ -24,7 +24,8 @@ def stated_bits(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[int]:
         largest = page.tags.valueof(name)
         if isinstance(largest, int | float) and float(largest).is_integer() and _is_all_ones(int(largest)):
             found.append(int(largest).bit_length())
-    return sorted({bits for bits in found if bits > 0})
+    size = 0 if page.dtype is None else 8 * page.dtype.itemsize
+    return sorted({bits for bits in found if 0 < bits < size})
 
 
 def _texts(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[str]:

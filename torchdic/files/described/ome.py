@@ -54,8 +54,8 @@ def warn_of_guessed_axes(root: ElementTree.Element, path: Path) -> None:
     planes, prisms = pixels.get("SizeZ"), pixels.get("SizeC")
     if pixels.get("DimensionOrder") == "XYCZT" and planes == prisms != "1":
         warnings.warn(
-            f"{path}: its axes are Z, C, y, x, as tifffile writes them where none are named: Z ({planes}) is taken as the "
-            f"focus and C ({prisms}) as the prism; metadata={{'axes': 'CZYX'}} writes them the other way round",
+            f"{path}: its axes are Z, C, y, x, as tifffile writes them where none is named: Z ({planes}) is taken as "
+            f"the focus and C ({prisms}) as the prism; metadata={{'axes': 'CZYX'}} writes them the other way round",
             StackWarning,
             stacklevel=4,
         )
