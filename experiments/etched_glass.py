@@ -22,6 +22,7 @@ from torch import Tensor
 from data_synthetic import EtchedGlassGrating, EtchedGlassStep
 from data_synthetic.etched import EtchedGlass
 from recon.report import figures
+from recon.report.terminal import write_plainly
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image, image_field
 
 GRID = Grid((16, 128, 128), (0.025, 0.125, 0.125))
@@ -43,6 +44,7 @@ SPECIMENS: dict[str, EtchedGlass] = {
 
 def main() -> int:
     """Compute the images of both and draw them; returns the exit code."""
+    write_plainly()
     parser = argparse.ArgumentParser(description="DIC images of an etched step and grating against a thin step's law.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     out: Path = parser.parse_args().out

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from data_synthetic import Bead
 from recon.report import figures
+from recon.report.terminal import write_plainly
 from recon.run.exact_images import WIDENING, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -31,6 +32,7 @@ SOURCES = 80  # with fewer, images out of focus are speckled
 
 def main() -> int:
     """Compute both stacks and draw them; returns the exit code."""
+    write_plainly()
     parser = argparse.ArgumentParser(description="DIC images of a bead in optical cement, modelled and exact.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     out: Path = parser.parse_args().out

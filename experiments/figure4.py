@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from recon.report import figures
+from recon.report.terminal import write_plainly
 from torchdic import Grid, Volume
 from torchdic.object_aberration.wavefront import effective_defocus
 
@@ -40,6 +41,7 @@ LIMIT = 0.4  # µm, where the colours of δ end
 
 def main() -> int:
     """Compute both maps and draw them; returns the exit code."""
+    write_plainly()
     parser = argparse.ArgumentParser(description="Index, aberration and distorted planes of focus of two objects.")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     out: Path = parser.parse_args().out

@@ -23,6 +23,7 @@ from recon.config.schema import Config, ConfigError, DataSection
 from recon.recording.background import background_surface
 from recon.recording.shear_axis import ShearAxis, estimate_shear_axis
 from recon.report import figures
+from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.reconstruct import reconstruct
 from torchdic import Acquisition, Prism
@@ -34,6 +35,7 @@ CONFIG = Path(__file__).with_name("measured.toml")
 
 def main() -> int:
     """Run the experiment; returns the exit code, 2 for bad input."""
+    write_plainly()
     parser = argparse.ArgumentParser(description="Phase, on an arbitrary scale, from one measured DIC image.")
     parser.add_argument("image", type=Path, nargs="?", metavar="IMAGE.tif")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")

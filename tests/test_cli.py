@@ -13,6 +13,8 @@ import tomli_w
 import torchdic
 from recon.cli import main
 from recon.cli.specimens import SPECIMENS
+from recon.config.reading import load
+from recon.run.data import load_data
 from torchdic.files.stack import read_stack, write_stack
 
 CONFIG = """
@@ -211,6 +213,19 @@ def test_a_stack_that_cannot_be_used_is_refused_in_one_line(write, refused, tmp_
     line = refused("reconstruct", write())
     assert str(tmp_path / "stack.ome.tif") in line
     assert [word for word in words if word not in line] == []
+
+
+def test_a_stack_among_several_is_taken_by_its_number(write, run, tmp_path):
+    data = np.random.default_rng(0).random((3, *SHAPE), np.float32)
+    with tifffile.TiffWriter(tmp_path / "stack.ome.tif", ome=True) as tif:
+        for stack in data:
+            tif.write(stack, photometric="minisblack", metadata={"axes": "CZYX"})
+    code, (line,) = run("reconstruct", write())
+    assert code == 2
+    assert "holds 3 equal series (2 × 3 × 14 × 12 each)" in line
+    assert "series = 0 … 2 in [data]" in line
+    read = load_data(load(write({"data.series": 1})))
+    assert np.allclose(read.data, data[1])
 
 
 def test_an_extinct_prisms_counts_ask_for_a_scale(write, refused, tmp_path):

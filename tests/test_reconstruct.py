@@ -453,7 +453,8 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     done = len(rows(out))
     assert 12 <= done < LONG
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
-    assert not RESULTS - {"log.csv"} & set(content(out))  # no result is there before its time
+    early = {"log.csv"} if name == "SIGKILL" else {"log.csv", "volume.ome.tif"}  # the volume so far
+    assert RESULTS & set(content(out)) == early  # no other result is there before its time
     if name == "SIGKILL":
         assert code == -signal.SIGKILL
         assert done - kept <= 5  # at most one interval
@@ -521,7 +522,7 @@ def stopped(other, interrupt, tmp_path):
     path, out = other({"reconstruction": {"steps": 8}}), tmp_path / "out"
     interrupt(4)
     assert command("reconstruct", path, "--out", out)[0] == 130
-    assert set(content(out)) == {"log.csv", "checkpoint.pt"}
+    assert set(content(out)) == {"log.csv", "checkpoint.pt", "volume.ome.tif"}
     return path, out
 
 
@@ -547,6 +548,30 @@ def test_a_run_that_dies_between_checkpoints_goes_on_from_the_last(other, monkey
     assert torch.equal(volume(out), volume(workplace / "whole"))
     for column in ("step", "misfit", "loss"):
         assert [row[column] for row in rows(out)] == [row[column] for row in rows(workplace / "whole")]
+
+
+def test_an_interrupted_run_leaves_the_volume_so_far(stopped, other, tmp_path):
+    _, out = stopped
+    assert command("reconstruct", other({"reconstruction": {"steps": 3}}), "--out", tmp_path / "short")[0] == 0
+    assert torch.equal(volume(out), volume(tmp_path / "short"))
+    assert read_volume(out / "volume.ome.tif")[1] == GRID
+    assert read_stack(out / "volume.ome.tif").names == ("delta n, interrupted after step 3",)
+
+
+def test_an_interrupted_run_leaves_earlier_results_alone(other, interrupt, tmp_path):
+    out = tmp_path / "out"
+    assert command("reconstruct", other({"reconstruction": {"steps": 2}}), "--out", out)[0] == 0
+    before = content(out)
+    interrupt(3)
+    path = other({"reconstruction": {"steps": 5}})
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 130
+    assert "interrupted after step 2 of 5; go on with --resume; volume.interrupted.ome.tif holds Δn so far" in err
+    after = content(out)
+    assert after.keys() - before.keys() == {"checkpoint.pt", "volume.interrupted.ome.tif"}
+    assert {name for name in before if before[name] != after[name]} <= {"log.csv"}
+    assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
+    assert set(content(out)) == RESULTS
 
 
 def test_an_interrupted_run_is_not_overwritten_unasked(stopped):

@@ -11,10 +11,13 @@ from tqdm import tqdm
 
 from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
 from recon.config.schema import ConfigError
+from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
+from recon.run.results import ResultsError
 from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
@@ -63,11 +66,12 @@ def main(typed: Sequence[str] | None = None) -> int:
     typed: the words after `torchdic`; None takes them from the command line.
     Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
     """
+    write_plainly()
     options = _parser().parse_args(typed)
     _show_each_warning_once()
     try:
         options.run(options)
-    except (ConfigError, StackError, CheckpointError) as error:
+    except (ConfigError, StackError, CheckpointError, ResultsError, WriteError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)

@@ -13,7 +13,9 @@ from cattrs import transform_error
 from cattrs.errors import ForbiddenExtraKeysError
 
 from recon.config.conversion import converter
+from recon.config.encoding import decoded
 from recon.config.schema import Config, ConfigError, UnitsWarning
+from recon.config.units import wrong_unit
 
 T = TypeVar("T")
 
@@ -21,34 +23,34 @@ T = TypeVar("T")
 def load(path: str | os.PathLike[str]) -> Config:
     """Read a configuration file. A relative path in it starts from its folder.
 
-    Raises ConfigError where the file can't be used. Warns UnitsWarning of a bias above 2π and of a shear longer than
-    the volume is wide: such values are likely in degrees and in nm.
+    Raises ConfigError where the file can't be used, or where a value can't be in its unit, such as a wavelength of 546
+    µm. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit.
     """
     path = Path(path)
     try:
-        text = path.read_bytes().decode("utf-8")
-        values = tomllib.loads(text)
+        values = tomllib.loads(decoded(path.read_bytes()))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:  # TOMLDecodeError is one
         raise ConfigError(f"{path}: is not TOML: {error}") from error
+    wrong = wrong_unit(values)
+    if wrong is not None:
+        raise ConfigError(f"{path}: {wrong}")
     config = structure(values, Config, str(path))
     if config.data is not None:
         data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
         config = dataclasses.replace(config, data=data)
-    _warn_of_other_units(config, path)
+    _warn_of_long_shears(config, path)
     return config
 
 
-def _warn_of_other_units(config: Config, path: Path) -> None:
+def _warn_of_long_shears(config: Config, path: Path) -> None:
     widest = max(config.volume.grid.extent[1:])
     for index, prism in enumerate(config.acquisition.prisms):
         if prism is None:
             continue
         named = f"{path}: acquisition.prisms[{index}]"
-        shear, bias = math.hypot(*map(float, prism.shear)), float(prism.bias)
-        if abs(bias) > 2 * math.pi:
-            warnings.warn(f"{named}.bias: {bias:g} is more than a turn; angles are in rad", UnitsWarning, stacklevel=3)
+        shear = math.hypot(*map(float, prism.shear))
         if shear > widest:
             warnings.warn(
                 f"{named}.shear: {shear:g} is longer than the volume's {widest:g} µm; lengths are in µm",

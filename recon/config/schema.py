@@ -96,8 +96,9 @@ class DataSection:
     order: of the polynomial in (y, x) that is fitted to a background.
     gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
         None is one noise for each prism, as it was measured.
-    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite and an order
-    below 0.
+    series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
+    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
+    or a series below 0.
     """
 
     path: str
@@ -107,6 +108,7 @@ class DataSection:
     order: int = 2
     gain: float | None = None
     read_noise: float = 0.0
+    series: int | None = None
 
     def __post_init__(self) -> None:
         if self.gain is not None and not (0 < self.gain < math.inf):
@@ -119,6 +121,8 @@ class DataSection:
             raise ValueError(f"offset {self.offset} must be finite")
         if self.order < 0:
             raise ValueError(f"order {self.order} must be at least 0")
+        if self.series is not None and self.series < 0:
+            raise ValueError(f"series {self.series} must be at least 0; the first is 0")
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,7 @@ def _check_saturation(stack: Stack) -> None:
     if count > _SATURATED * stack.data.size:
         warnings.warn(
             f"{stack.source}: {count} of {stack.data.size} pixels ({count / stack.data.size:.1%}) are "
-            f"saturated at {limit}; their intensity is unknown",
+            f"saturated at {limit:g}; their intensity is unknown",
             StackWarning,
             stacklevel=3,
         )

@@ -1,5 +1,6 @@
 """Pictures of a reconstruction: images beside the model's, sections through the volume, and the fall of the misfit."""
 
+import io
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,9 +22,11 @@ MOST_PLANES = 7
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG. If that fails, an earlier file stays as it was."""
+    """Write a figure as PNG. If that fails, an earlier file stays as it was. Raises WriteError."""
+    drawn = io.BytesIO()  # the encoder of PNG wouldn't tell why a file cannot be written
+    figure.savefig(drawn, dpi=DPI, format="png")
     with written_whole(path) as partial:
-        figure.savefig(partial, dpi=DPI)
+        partial.write_bytes(drawn.getbuffer())
 
 
 def leave(figure: Figure, path: Path) -> int:

@@ -1,5 +1,6 @@
 """A descent that is saved on disk, so that it can go on after an interruption."""
 
+import warnings
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import torch
 
 from recon.fit.step import Row, Step
-from torchdic.files.whole import written_whole
+from torchdic.files.whole import WriteError, written_whole
 
 # Number of the format that is written and read. Checkpoints of before the second had none.
 FORMAT = 2
@@ -15,6 +16,10 @@ FORMAT = 2
 
 class CheckpointError(ValueError):
     """A checkpoint that a run can't go on from: one line with the file and the reason."""
+
+
+class UnsavedWarning(UserWarning):
+    """A file that a run leaves on its way cannot be written. The run goes on without it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +36,26 @@ class Checkpoint:
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint. If that fails, an earlier one in the file stays as it was."""
+    """Write a checkpoint. If that fails, an earlier one in the file stays as it was. Raises WriteError."""
     step = {f.name: getattr(checkpoint.step, f.name) for f in fields(Step)}
     content = {"format": FORMAT, "step": step, "rows": checkpoint.rows, "identity": checkpoint.identity}
-    with written_whole(path) as partial:
-        torch.save(content, partial)
+    with written_whole(path) as partial, partial.open("wb") as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # torch's own words for what the file raised
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
+
+
+def save_if_possible(path: Path, checkpoint: Checkpoint) -> bool:
+    """Write a checkpoint, or warn UnsavedWarning where it cannot be written; returns whether it was."""
+    try:
+        save(path, checkpoint)
+    except WriteError as error:
+        warnings.warn(f"{error}; the run goes on without this checkpoint", UnsavedWarning, stacklevel=3)
+        return False
+    return True
 
 
 def load(path: Path, identity: str) -> Checkpoint:

@@ -26,7 +26,7 @@ def load_data(config: Config) -> Measured:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     _check_support(config)
     section = config.data
-    stack = read_stack(section.path)
+    stack = read_stack(section.path, section.series)
     expected = ExpectedStack(
         biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
         focus=tuple(float(focus) for focus in config.acquisition.focus),

@@ -17,11 +17,11 @@ from recon.misfit.base import Misfit
 from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
 from recon.run import checkpoint
-from recon.run.checkpoint import Checkpoint, CheckpointError
+from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, descend_recorded
-from recon.run.results import Result, write_results
+from recon.run.results import Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
 from torchdic.files.whole import written_whole
@@ -50,7 +50,8 @@ def reconstruct(
     resume: go on from the checkpoint in `out`, if there is one. restart: begin anew although there is one.
     misfit: makes the misfit that is lowered from the prepared stack (prism, focus, y, x); None is the configuration's.
     Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
-    the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint saved.
+    the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint and the volume so far saved;
+    ResultsError where results cannot be written.
     """
     config = _spelled_out(config)
     measured = load_data(config)
@@ -72,7 +73,11 @@ def reconstruct(
         check_room_for_descent(problem, made)
         prepare_folder(out)
         ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
-    result = write_results(out, config, measured, problem, ended, sections)
+    try:
+        result = write_results(out, config, measured, problem, ended, sections)
+    except ResultsError as error:
+        kept = config.reconstruction.method not in DIRECT and save_if_possible(out / CHECKPOINT, ended)
+        raise ResultsError(f"{error}{'; make room and go on with --resume' if kept else ''}") from error
     (out / CHECKPOINT).unlink(missing_ok=True)
     return result
 

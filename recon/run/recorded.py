@@ -8,10 +8,12 @@ from recon.fit.descent import minimise
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
-from recon.run import checkpoint
-from recon.run.checkpoint import Checkpoint
+from recon.run.checkpoint import Checkpoint, save, save_if_possible
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
+from recon.run.results import leave_interrupted
+from torchdic.errors import StackError
+from torchdic.files.whole import WriteError
 
 LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 
@@ -23,8 +25,8 @@ def descend_recorded(
 
     out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
     depends on, for the checkpoint. start: to go on from.
-    Raises InterruptedRunError on Ctrl-C or SIGTERM, with a checkpoint of the last step saved; FloatingPointError where
-    the fit diverges.
+    Raises InterruptedRunError on Ctrl-C or SIGTERM, with a checkpoint and the volume of the last step saved;
+    FloatingPointError where the fit diverges. Warns UnsavedWarning where the log or a checkpoint cannot be written.
     """
     step: Step | None = None if start is None else start.step
     rows = [] if start is None else start.rows
@@ -44,15 +46,27 @@ def descend_recorded(
                 bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
                 bar.update()
                 if step.number % checkpoint_every == 0:
-                    checkpoint.save(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
+                    save_if_possible(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
                 check_signals()
         except KeyboardInterrupt:
             if step is None:
                 raise InterruptedRunError("interrupted before the first step") from None
             log.add(step.row)  # the signal may have come between the step and its row
-            checkpoint.save(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
-            raise InterruptedRunError(
-                f"interrupted after step {step.number} of {problem.steps}; go on with --resume"
-            ) from None
+            raise InterruptedRunError(_left(out, problem, Checkpoint(step, log.rows, identity))) from None
         assert step is not None
         return Checkpoint(step, log.rows, identity)
+
+
+def _left(out: Path, problem: Problem, stopped: Checkpoint) -> str:
+    """Leave a checkpoint and the volume of an interrupted descent; returns a line about it for the user."""
+    line = f"interrupted after step {stopped.step.number} of {problem.steps}"
+    try:
+        save(out / CHECKPOINT, stopped)
+        line += "; go on with --resume"
+    except WriteError as error:
+        line += f"; {error}"
+    try:
+        line += f"; {leave_interrupted(out, problem, stopped.step).name} holds Δn so far"
+    except StackError as error:
+        line += f"; {error}"
+    return line

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -21,9 +22,19 @@ from recon.recording.background import known_levels
 from recon.recording.preparation import Measured, PrismReport
 from recon.report import figures
 from recon.report.metrics import residual_rms
-from recon.run.checkpoint import Checkpoint
+from recon.run.checkpoint import Checkpoint, UnsavedWarning
+from torchdic import Grid
+from torchdic.errors import StackError
 from torchdic.files.stack import write_stack, write_volume
-from torchdic.files.whole import write_json, write_text
+from torchdic.files.whole import WriteError, write_json, write_text
+
+VOLUME, METRICS = "volume.ome.tif", "metrics.json"
+# The volume of a descent that was interrupted, beside the results of one that wasn't.
+INTERRUPTED = "volume.interrupted.ome.tif"
+
+
+class ResultsError(ValueError):
+    """Results cannot be written: one line with the files and the reason."""
 
 
 class PoorFitWarning(UserWarning):
@@ -110,22 +121,76 @@ def write_results(
     """Write a finished descent's volume, metrics, resolved configuration and figures into a folder.
 
     sections: optical path lengths in µm, where the method gives them.
+    Raises ResultsError where some of them cannot be written; the others are.
     """
     last, grid = ended.step, problem.setup.field
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured.prisms, config.reconstruction.method)
     warn_of_poor_fit(found["misfit"])
-    write_volume(out / "volume.ome.tif", delta, grid)
     comments = "".join(f"# {announce_record(record)}\n" for record in last.plans)
-    write_text(out / "config.resolved.toml", comments + dump(config))
-    write_json(out / "metrics.json", found)
-    drawn = figures.draw_images(data, images.cpu(), config.acquisition.prisms, measured.focus, problem.setup.field)
-    figures.save(drawn, out / "images.png")
-    figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png")
-    if ended.rows:
-        figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
-    if sections is not None:
-        steps = [abs(b - a) for a, b in pairwise(measured.focus)]
-        write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
+    prisms = config.acquisition.prisms
+
+    def write_sections() -> None:
+        if sections is not None:
+            steps = [abs(b - a) for a, b in pairwise(measured.focus)]
+            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
+
+    def draw_images() -> None:
+        figures.save(figures.draw_images(data, images.cpu(), prisms, measured.focus, grid), out / "images.png")
+
+    def draw_misfit() -> None:
+        if ended.rows:
+            figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
+
+    _write_each(
+        (
+            lambda: _write_volume(out / VOLUME, delta, grid),
+            lambda: write_json(out / METRICS, found),
+            lambda: write_text(out / "config.resolved.toml", comments + dump(config)),
+            write_sections,
+            draw_images,
+            lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
+            draw_misfit,
+        )
+    )
+    (out / INTERRUPTED).unlink(missing_ok=True)
     return Result(delta, found)
+
+
+def leave_interrupted(out: Path, problem: Problem, step: Step) -> Path:
+    """Write the volume of an interrupted descent, to be looked at; returns its file.
+
+    It is the usual one, unless the folder has the results of a finished descent. Raises StackError.
+    """
+    path = out / (INTERRUPTED if (out / METRICS).exists() else VOLUME)
+    delta = problem.setup.within_field(step.delta).detach().cpu()
+    _write_volume(path, delta, problem.setup.field, f"delta n, interrupted after step {step.number}")
+    return path
+
+
+def _write_volume(path: Path, delta: Float[Tensor, "z y x"], grid: Grid, name: str = "delta n") -> None:
+    """Write a volume as it is, or compressed where there is no room for that. Raises StackError, warns UnsavedWarning.
+
+    name: of the file's one channel.
+    """
+    try:
+        write_volume(path, delta, grid, name=name)
+    except StackError as error:
+        if not isinstance(error.__cause__, WriteError):
+            raise
+        write_volume(path, delta, grid, name=name, compression="zlib")
+        warnings.warn(f"{error}; it is written compressed instead", UnsavedWarning, stacklevel=2)
+
+
+def _write_each(writers: Sequence[Callable[[], None]]) -> None:
+    """Write each result although another one cannot be written, and raise ResultsError of those at the end."""
+    failed: list[str] = []
+    for write in writers:
+        try:
+            write()
+        except (WriteError, StackError) as error:
+            failed.append(str(error))
+    if failed:
+        others = f"; nor can {len(failed) - 1} other results" if len(failed) > 1 else ""
+        raise ResultsError(f"{failed[0]}{others}")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from torchdic.errors import StackError
+from torchdic.files.full_scale import full_scale
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class Stack:
     bits: bits per pixel, which may be fewer than the dtype has (a 12-bit camera); None where the file does not say.
     names: one name per prism; () where the file has none.
     source: the file's path, for messages.
+    full_scale: the value at which a camera's pixel is saturated, where a calibration of the values has moved it. Pixels
+        for which it is given are counts even as floats.
     Raises StackError where data does not have 4 axes.
     """
 
@@ -29,6 +32,7 @@ class Stack:
     bits: int | None = None
     names: tuple[str, ...] = ()
     source: str = "stack"
+    full_scale: float | None = None
 
     def __post_init__(self) -> None:
         if self.data.ndim != 4:
@@ -36,16 +40,15 @@ class Stack:
 
     @property
     def is_integer(self) -> bool:
-        """Whether the pixels are a camera's counts. Float pixels are relative to the empty bright field."""
-        return self.data.dtype.kind in "iu"
+        """Whether the pixels are a camera's counts. Other float pixels are relative to the empty bright field."""
+        return self.data.dtype.kind in "iu" or self.full_scale is not None
 
     @property
-    def saturation(self) -> int | None:
-        """The largest value that an integer pixel can hold; None for float pixels."""
+    def saturation(self) -> float | None:
+        """The value at which a count is saturated; None for pixels that are relative to the empty bright field."""
         if not self.is_integer:
             return None
-        limit = int(np.iinfo(self.data.dtype).max)
-        return min(limit, 2**self.bits - 1) if self.bits and self.data.dtype.kind == "u" else limit
+        return full_scale(self.data, self.bits) if self.full_scale is None else self.full_scale
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Format:
         finite and its sizes are above 0. The path lies beside the final one and is moved there afterwards, so an
         interrupted write leaves no half a file. None for a format that is only read.
     dtypes: the names of the dtypes that `write` can store.
+    read_series: as `read`, with the number of a series, counted from 0, of which a file may hold several; None for a
+        format whose files hold one.
     """
 
     name: str
@@ -68,6 +73,7 @@ class Format:
     read: Callable[[Path], Stack]
     write: Callable[[Path, Stack, str | None], None] | None = None
     dtypes: tuple[str, ...] = ()
+    read_series: Callable[[Path, int], Stack] | None = None
 
 
 def shape_text(shape: Sequence[int]) -> str:

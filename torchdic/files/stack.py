@@ -17,7 +17,7 @@ from torch import Tensor
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.tiff import TIFF
-from torchdic.files.whole import written_whole
+from torchdic.files.whole import WriteError, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
@@ -30,24 +30,28 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     return next((known for known in FORMATS if name.endswith(known.suffixes)), TIFF)
 
 
-def read_stack(path: str | os.PathLike[str]) -> Stack:
+def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack:
     """Read a stack of greyscale images. Its axes and sizes come from the file.
 
     path: a file in one of `FORMATS`. Compressed files are read too.
+    series: which one of several stacks (series or positions) in the file, counted from 0; None for the only one.
 
     In OME-TIFF and ImageJ TIFF the C axis is the prism and Z the focus. In plain TIFF, 2-D data is one plane, 3-D
-    is (focus, y, x) and 4-D is (prism, focus, y, x). Sizes come from OME-XML or, in an ImageJ TIFF, from the
-    resolution, the unit and the spacing. The resolution of any other TIFF is meant for printing and is ignored.
+    is (focus, y, x) and 4-D is (prism, focus, y, x); pages that were written one by one are planes. An axis of time is
+    taken as the focus where the file has no other. Sizes come from OME-XML or, in an ImageJ TIFF, from the resolution,
+    the units and the spacing. The resolution of any other TIFF is meant for printing and is ignored. ImageJ's
+    straight-line calibration of the values is applied.
 
     Raises StackError for a file that is missing, in no known format, truncated, empty or coloured, that has more
-    dimensions or a dtype other than integer and float, or that has pixels that are not finite.
-    Warns StackWarning of a size whose unit is no length.
+    dimensions or a dtype other than integer and float, that holds several series of which none is chosen, or that has
+    pixels that are not finite.
+    Warns StackWarning of a size that is no length, of time that is taken as the focus, and of a calibration.
     """
     path = Path(path)
     _check_openable(path)
     known = format_of(path)
     try:
-        stack = known.read(path)
+        stack = known.read(path) if series is None else _read_one(known, path, series)
     except (StackError, StackWarning):  # the latter where warnings are errors
         raise
     except Exception as error:
@@ -135,6 +139,12 @@ def write_volume(
     _write(path, Stack(voxels, grid.spacing[1:], grid.spacing[0], names=(name,), source=str(path)), compression)
 
 
+def _read_one(known: Format, path: Path, series: int) -> Stack:
+    if known.read_series is None:
+        raise StackError(f"{path}: series {series}: a file in {known.name} holds one")
+    return known.read_series(path, series)
+
+
 def _as_array(data: np.ndarray | Tensor) -> np.ndarray:
     return data.detach().cpu().numpy() if isinstance(data, Tensor) else np.asarray(data)
 
@@ -148,8 +158,8 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
     try:
         with written_whole(path) as partial:
             known.write(partial, stack, compression)
-    except OSError as error:
-        raise StackError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except WriteError as error:
+        raise StackError(str(error)) from error
 
 
 def _check_openable(path: Path) -> None:

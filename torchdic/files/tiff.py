@@ -3,92 +3,128 @@
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tifffile
-from jaxtyping import Shaped
 
 from torchdic.errors import StackError
+from torchdic.files.arrangement.axes import arrange, place_axis
+from torchdic.files.arrangement.grey import check_grey, greys_of_palette, has_palette
+from torchdic.files.arrangement.series import chosen_series, pages_one_by_one
+from torchdic.files.described import ome
+from torchdic.files.described.bits import stated_bits
+from torchdic.files.described.imagej import StraightLine, calibration, imagej_sizes
 from torchdic.files.format import Format, Stack, shape_text
-from torchdic.files.tiff_sizes import sizes_and_names
+from torchdic.files.full_scale import full_scale
 from torchdic.files.tiff_structure import check_pages, check_pixels
 
-_GREY = 1  # PhotometricInterpretation MINISBLACK: the value grows with the light
-
-_PHOTOMETRIC = {0: "0 is white", 2: "RGB", 3: "a colour palette", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}
-
 _OME_DTYPES = ("int8", "int16", "int32", "uint8", "uint16", "uint32", "float32", "float64")
+
+_MOST_PER_CENTIMETRE = 2**32 - 1  # a resolution is a fraction of two 32-bit integers
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """Pixels as the file holds them, tifffile's letter of each of their axes, and the page that describes them."""
+
+    data: np.ndarray
+    axes: str
+    page: tifffile.TiffPage
 
 
 def _read(path: Path) -> Stack:
     """The stack in a TIFF."""
+    return _read_series(path)
+
+
+def _read_series(path: Path, number: int | None = None) -> Stack:
+    """One stack of a TIFF that may hold several; number: which, counted from 0, None for the only one."""
     check_pages(path)
     with _tifffile_logs_as_debug(), tifffile.TiffFile(path) as tif:
-        (focus_step, dy, dx), names = sizes_and_names(tif, path)
-        series = _only_series(tif, path)
-        data = _pixels(tif, series, path)
-        bits = series.keyframe.bitspersample
+        sizes, names, places = _described(tif, path, number or 0)
+        planes = _planes(tif, path, number, places=places)
+        line = calibration(tif, path)
+        depths = stated_bits(tif, planes.page)
+        data = arrange(planes.data, planes.axes, path)
     data = np.ascontiguousarray(data, dtype=data.dtype.newbyteorder("="))
+    (focus_step, dy, dx), counts = sizes, data.dtype.kind in "iu"
+    top = int(data.max()) if counts else 0
+    bits = next((bits for bits in depths if top < 2**bits), None)
+    calibrated = data if line is None else line.of(data)
     return Stack(
-        data,
+        calibrated,
         pixel_size=None if dy is None or dx is None else (dy, dx),
         focus_step=focus_step,
-        bits=bits if isinstance(bits, int) else None,
+        bits=bits,
         names=names if len(names) == len(data) else (),
         source=str(path),
+        full_scale=None if line is None or not counts else _calibrated_scale(data, calibrated, bits, line),
     )
 
 
-def _only_series(tif: tifffile.TiffFile, path: Path) -> tifffile.TiffPageSeries:
-    """The one series of images in the file, arranged as its header says."""
-    if not tif.series:
-        raise StackError(f"{path}: holds no images")
-    if len(tif.series) > 1:
-        shapes = ", ".join(shape_text(series.shape) for series in tif.series)
-        raise StackError(f"{path}: holds {len(tif.series)} unequal images ({shapes}); a stack is one series")
-    series = tif.series[0]
-    # tifffile falls back to a plain row of pages where the header is broken or promises more than is there
+def _described(tif: tifffile.TiffFile, path: Path, number: int) -> tuple[ome.Sizes, tuple[str, ...], bool]:
+    """Sizes in µm and the prisms' names of an image, and whether the images lie at more than one place.
+
+    A size is None and the names are () where the file does not say. Raises StackError for OME-XML that cannot be
+    parsed or that spreads the stack over files that are missing.
+    """
+    if tif.is_ome:
+        root = ome.parsed(tif, path)
+        ome.find_planes(tif, root, path)
+        ome.warn_of_guessed_axes(root, path)
+        return *ome.sizes_and_names(root, path, number), ome.has_places(root)
+    return imagej_sizes(tif, path) if tif.is_imagej else (None, None, None), (), False
+
+
+def _planes(tif: tifffile.TiffFile, path: Path, number: int | None, *, places: bool) -> _Planes:
+    """The pixels of a series, or of pages that were written one by one. places: whether images are places instead."""
+    pages = pages_one_by_one(tif) if number is None and not places else None
+    if pages is not None:
+        for series in tif.series:
+            _check_series(tif, series, path)
+        page = tif.series[0].keyframe
+        data, axes = np.stack([page.asarray() for page in pages]), "IYX"
+    else:
+        series, place = chosen_series(tif, path, number)
+        _check_kind(tif, series, path)
+        page = series.keyframe
+        axes = _check_series(tif, series, path)
+        data = series.asarray(squeeze=False)
+        if data.shape != series.get_shape(squeeze=False):
+            shape = shape_text(series.get_shape(squeeze=False))
+            raise StackError(f"{path}: holds {shape_text(data.shape)} pixels, its header says {shape} along {axes}")
+        along = place_axis(data.shape, axes)
+        if place is not None and along is not None:
+            data, axes = data.take(place, along), axes[:along] + axes[along + 1 :]
+    if has_palette(page):
+        data = greys_of_palette(data, [p for p in tif.pages if isinstance(p, tifffile.TiffPage)], path)
+    return _Planes(data, axes, page)
+
+
+def _check_kind(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path: Path) -> None:
+    """Raise StackError where tifffile fell back to a plain row of pages: the header is broken or promises too much."""
     if tif.is_ome and series.kind not in ("ome", "mmstack"):
         raise StackError(f"{path}: its OME-XML does not describe its pages")
     if tif.is_imagej and not tif.is_ome and series.kind not in ("imagej", "mmstack"):
         raise StackError(f"{path}: truncated: its ImageJ header promises more planes than the file holds")
-    return series
 
 
-def _pixels(
-    tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path: Path
-) -> Shaped[np.ndarray, "prism focus y x"]:
-    """The series' pixels, in the file's byte order. Raises StackError where they are no greyscale stack."""
-    page = series.keyframe
-    axes = series.get_axes(squeeze=False)
+def _check_series(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path: Path) -> str:
+    """The letters of a series' axes. Raises StackError where its pixels are no greyscale stack, or are missing."""
+    page, axes = series.keyframe, series.get_axes(squeeze=False)
     if _is_array_stored_as_colour(series):
         axes = axes.replace("S", "Q")
     else:
-        _check_grey(page, path)
+        check_grey(page, path)
     if page.dtype is None or page.dtype.kind not in "iuf":
         raise StackError(f"{path}: pixels are {page.dtype}, a stack holds integers or floats")
     shape = tuple(series.get_shape(squeeze=False))
     if 0 in shape:
         raise StackError(f"{path}: is empty, {shape_text(shape)} along {axes}; a stack has at least one pixel")
     check_pixels(tif, series, path)
-    data = series.asarray(squeeze=False)
-    if data.shape != shape:
-        raise StackError(
-            f"{path}: holds {shape_text(data.shape)} pixels, its header says {shape_text(shape)} along {axes}"
-        )
-    return _arrange(data, axes, path)
-
-
-def _check_grey(page: tifffile.TiffPage, path: Path) -> None:
-    if page.samplesperpixel > 1:
-        raise StackError(
-            f"{path}: is a colour image, {page.samplesperpixel} samples per pixel; a stack is grey "
-            "(tifffile writes one with photometric='minisblack')"
-        )
-    if "PhotometricInterpretation" in page.tags and page.photometric != _GREY:
-        kind = _PHOTOMETRIC.get(int(page.photometric), f"photometric interpretation {int(page.photometric)}")
-        raise StackError(f"{path}: is not greyscale ({kind}); a stack's values grow with the light")
+    return axes
 
 
 def _is_array_stored_as_colour(series: tifffile.TiffPageSeries) -> bool:
@@ -98,41 +134,11 @@ def _is_array_stored_as_colour(series: tifffile.TiffPageSeries) -> bool:
     return series.kind == "shaped" and planar and page.dtype is not None and page.dtype.kind == "f"
 
 
-def _arrange(data: np.ndarray, axes: str, path: Path) -> Shaped[np.ndarray, "prism focus y x"]:
-    """The array as (prism, focus, y, x). axes: tifffile's letter of each axis; Q and I are axes without a name."""
-    _check_axes(data.shape, axes, path)
-    source = _places_of_axes(data.shape, axes, path)
-    order = [source[axis] for axis in "CZYX" if axis in source]
-    rest = [i for i in range(data.ndim) if i not in order]
-    data = data.transpose(*rest, *order)
-    shape = dict(zip([axis for axis in "CZYX" if axis in source], data.shape[len(rest) :], strict=True))
-    return data.reshape([shape.get(axis, 1) for axis in "CZYX"])
-
-
-def _check_axes(shape: tuple[int, ...], axes: str, path: Path) -> None:
-    """Raise StackError for an array without y and x, for colours and for time."""
-    if axes.count("Y") != 1 or axes.count("X") != 1:
-        raise StackError(f"{path}: is no image ({axes}: {shape_text(shape)}); a stack has y and x")
-    for axis, length in zip(axes, shape, strict=True):
-        if axis == "S" and length > 1:
-            raise StackError(f"{path}: is a colour image, {length} samples per pixel; a stack is grey")
-        if axis == "T" and length > 1:
-            raise StackError(f"{path}: has {length} time points; a stack's axes are (prism, focus, y, x)")
-
-
-def _places_of_axes(shape: tuple[int, ...], axes: str, path: Path) -> dict[str, int]:
-    """Which axis of the array is C, Z, Y and X. Axes without a name become C and Z where these are free."""
-    nameless = [i for i, axis in enumerate(axes) if axis in "QI"]
-    free = [axis for axis in "CZ" if axis not in axes or shape[axes.index(axis)] == 1]
-    while len(nameless) > len(free) and shape[nameless[0]] == 1:
-        nameless.pop(0)
-    others = [axis for axis, n in zip(axes, shape, strict=True) if axis not in "CZYXSTQI" and n > 1]
-    if others or len(nameless) > len(free):
-        raise StackError(
-            f"{path}: has more dimensions ({axes}: {shape_text(shape)}) than a stack's (prism, focus, y, x)"
-        )
-    places = {axis: axes.index(axis) for axis in "CZYX" if axis in axes}
-    return places | dict(zip(free[len(free) - len(nameless) :], nameless, strict=True))
+def _calibrated_scale(data: np.ndarray, calibrated: np.ndarray, bits: int | None, line: StraightLine) -> float:
+    """The calibrated value at which the camera is saturated, see `full_scale`."""
+    ends = line.of(np.array([0, full_scale(data, bits)], data.dtype))
+    known = float(ends.max())
+    return min(known, full_scale(calibrated)) if calibrated.dtype.kind in "iu" else known
 
 
 def _write(path: Path, stack: Stack, compression: str | None) -> None:
@@ -145,7 +151,8 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
     if stack.names:
         metadata["Channel"] = {"Name": list(stack.names)}
     resolution = {}
-    if dy is not None and dx is not None:  # for readers without OME, plain ImageJ among them
+    if dy is not None and dx is not None and 1e4 / min(dy, dx) <= _MOST_PER_CENTIMETRE:
+        # for readers without OME, plain ImageJ among them
         resolution = {"resolution": (1e4 / dx, 1e4 / dy), "resolutionunit": "CENTIMETER"}
     with _tifffile_logs_as_debug():
         tifffile.imwrite(
@@ -175,4 +182,4 @@ def _tifffile_logs_as_debug() -> Iterator[None]:
         theirs.removeFilter(divert)
 
 
-TIFF = Format("TIFF", (".tif", ".tiff", ".tf2", ".tf8", ".btf"), _read, _write, _OME_DTYPES)
+TIFF = Format("TIFF", (".tif", ".tiff", ".tf2", ".tf8", ".btf"), _read, _write, _OME_DTYPES, read_series=_read_series)

@@ -101,9 +101,21 @@ def check_pixels(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path: 
                 raise StackError(f"{path}: page {page.index} misses a part of its pixels")
             if offset + count > size:
                 _raise_truncated(path, offset + count, size)
-    if series.dataoffset is None and any(page is None for page in series):
-        missing = sum(page is None for page in series)
+    if series.dataoffset is None:
+        _check_planes(tif, series, path)
+
+
+def _check_planes(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path: Path) -> None:
+    """Raise StackError where a plane of a series is missing, or lies in another file that ends before it."""
+    missing = sum(page is None for page in series)
+    if missing:
         raise StackError(f"{path}: {missing} of {len(series)} planes that its OME-XML lists are missing")
+    for page in series:
+        if page is not None and page.parent is not tif:
+            size = page.parent.filehandle.size
+            end = max(o + c for o, c in zip(page.dataoffsets, page.databytecounts, strict=True))
+            if end > size:
+                _raise_truncated(path.parent / page.parent.filename, end, size)
 
 
 def _raise_truncated(path: Path, end: int, size: int) -> NoReturn:

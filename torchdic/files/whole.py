@@ -8,14 +8,37 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+class WriteError(OSError):
+    """A file can't be written: one line with the file and the reason."""
+
+    @classmethod
+    def of(cls, path: Path, error: OSError) -> "WriteError":
+        """The error for a file, made of one that names another file, or none."""
+        # numpy and others tell no reason where a disk is full, only how many bytes they wrote
+        return cls(error.errno, error.strerror or f"{error}; the disk may be full", str(path))
+
+    def __str__(self) -> str:
+        return f"{self.filename}: cannot be written: {self.strerror}"
+
+
 @contextmanager
 def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path` to write to, and move that file to `path` when the block ends.
 
     If the block raises, the temporary file is removed and `path` stays as it was. The temporary file has the suffix of
-    `path`, because writers choose their format by it. Raises OSError where the folder cannot be written to.
+    `path`, because writers choose their format by it. Raises WriteError, which is an OSError, where the folder cannot
+    be written to, or where the block raises an OSError, as it does where the disk is full.
     """
     path = Path(path)
+    try:
+        with _moved_there(path) as partial:
+            yield partial
+    except OSError as error:
+        raise WriteError.of(path, error) from error
+
+
+@contextmanager
+def _moved_there(path: Path) -> Iterator[Path]:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
     os.close(handle)
     partial = Path(name)
@@ -30,13 +53,13 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file in UTF-8. An error leaves `path` as it was."""
+    """Write a text file in UTF-8. An error leaves `path` as it was. Raises WriteError."""
     with written_whole(path) as partial:
         partial.write_text(text, encoding="utf-8")
 
 
 def write_json(path: str | os.PathLike[str], values: object) -> None:
-    """Write values as JSON, indented by two spaces. An error leaves `path` as it was."""
+    """Write values as JSON, indented by two spaces. An error leaves `path` as it was. Raises WriteError."""
     write_text(path, json.dumps(values, indent=2) + "\n")
 
 

@@ -1,0 +1,151 @@
+"""Values in a wrong unit: lengths in nm, mm or m instead of µm, and angles in degrees instead of rad."""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+# Factors to µm of the units in which lengths are given by mistake, in the order in which they are tried.
+_LENGTHS = {"nm": 1e-3, "m": 1e6, "mm": 1e3}
+
+# A rounded full turn is still one.
+_TURN = 6.29
+
+# A specimen that is larger than the volume by this factor isn't in it, nor is a focus that is as far away.
+_BEYOND = 10
+
+
+@dataclass(frozen=True)
+class _Plausible:
+    """The sizes that a quantity can have, in µm or rad; 0 is none of a size.
+
+    keys: a regular expression of the keys that hold the quantity. what: its name. each: whether each number of an array
+    has to reach the lowest size, or the largest of them alone.
+    """
+
+    keys: str
+    what: str
+    lowest: float
+    highest: float
+    unit: str = "µm"
+    each: bool = False
+
+    def problem(self, key: str, numbers: dict[str, float]) -> str | None:
+        """What is wrong with a key's numbers, each with its place in the key; None where they may be right."""
+        largest = max(map(abs, numbers.values()))
+        for place, number in numbers.items():
+            size = abs(number)
+            tiny = 0 < size < self.lowest and (self.each or largest < self.lowest)
+            if tiny or size > self.highest:
+                return f"{key}{place}: {number:g} {self.unit} is no {self.what} {self._limits()}{self._meant(number)}"
+        return None
+
+    def _limits(self) -> str:
+        if self.lowest == 0:
+            return f"(at most {self.highest:g} {self.unit})"
+        return f"({self.lowest:g} to {self.highest:g} {self.unit})"
+
+    def _meant(self, number: float) -> str:
+        if self.unit == "rad":
+            return f"; angles are in rad: {number:g}° are {math.radians(number):.5g} rad"
+        for unit, factor in _LENGTHS.items():
+            if self.lowest <= abs(number) * factor <= self.highest:
+                return f"; lengths are in µm: {number:g} {unit} are {number * factor:.6g} µm"
+        return "; lengths are in µm"
+
+
+_PRISM = r"acquisition\.prisms\[\d+\]\."
+
+_QUANTITIES = (
+    _Plausible(
+        rf"microscope\.wavelength|microscope\.spectrum\.wavelengths|{_PRISM}wavelength",
+        "wavelength of light",
+        0.01,
+        20,
+        each=True,
+    ),
+    _Plausible(r"volume\.spacing", "size of a voxel", 1e-3, 100, each=True),
+    _Plausible(r"microscope\.camera\.pixel_size", "size of a pixel", 1e-3, 100),
+    _Plausible(rf"{_PRISM}shear", "shear", 1e-4, 20),
+    _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
+    _Plausible(rf"{_PRISM}offset", "offset of a prism", 1e-4, 1e5),
+    _Plausible(r"microscope\.objective\.layer\.thickness", "thickness of a layer", 1e-3, 1e4),
+    _Plausible(r"fidelity\.reference_plane", "depth in a volume", 1e-4, 1e3),
+    _Plausible(rf"{_PRISM}wedge", "angle of a wedge", 0, 1, "rad"),
+    _Plausible(
+        rf"{_PRISM}(bias|polariser|axis)|microscope\.polarisation\.(analyser_error|retardance_error)"
+        r"|microscope\.polarisation\.pupil\.retardance\.\d+",
+        "phase or angle of at most a turn",
+        0,
+        _TURN,
+        "rad",
+    ),
+    _Plausible(r"microscope\.objective\.aberrations\.\d+", "aberration of a lens", 0, 60, "rad"),
+)
+
+# A pixel may be coarse, but not as coarse as a slice.
+_LATERAL = _Plausible("", "size of a pixel", 1e-3, 20, each=True)
+
+_OF_SPECIMENS = r"specimen\.(sigma|radius|centre|height|offset|surface|edge|period|bottom|axis|.*semi_axes|.*\.centre)"
+
+
+def wrong_unit(values: dict[str, Any]) -> str | None:
+    """What is wrong with the first value that can't be in its unit, with its key and the value in that unit, or None.
+
+    values: of a configuration file, as TOML holds them. Values of a wrong type are passed over.
+    """
+    known = dict(_numbers(values))
+    quantities = (*_QUANTITIES, _focus(known), *_of_the_specimen(known))
+    for key, numbers in known.items():
+        if key == "volume.spacing":
+            lateral = {place: number for place, number in numbers.items() if place in ("[1]", "[2]")}
+            if lateral and (problem := _LATERAL.problem(key, lateral)):
+                return problem
+        for quantity in quantities:
+            if re.fullmatch(quantity.keys, key) and (problem := quantity.problem(key, numbers)):
+                return problem
+    return None
+
+
+def _focus(known: dict[str, dict[str, float]]) -> _Plausible:
+    """How far a focus may lie from the centre: not many times the volume's depth or the depth of field."""
+    wavelength, aperture = (known.get(f"microscope.{name}", {}).get("", 0) for name in ("wavelength", "objective.na"))
+    field = wavelength / aperture**2 if wavelength > 0 and aperture > 0 else math.inf
+    furthest = max(_BEYOND * max(_extent(known)[:1], default=0), 2 * _BEYOND * field, 50)
+    return _Plausible(r"acquisition\.focus", "focus in this volume", 1e-4, min(furthest, 1e4))
+
+
+def _of_the_specimen(known: dict[str, dict[str, float]]) -> list[_Plausible]:
+    """How large a specimen may be: it lies in the volume. An empty list where the volume isn't one."""
+    extent = _extent(known)
+    if not extent:
+        return []
+    return [_Plausible(_OF_SPECIMENS, "length of a specimen in this volume", 1e-4, max(_BEYOND * max(extent), 50))]
+
+
+def _extent(known: dict[str, dict[str, float]]) -> list[float]:
+    """The volume's size (z, y, x) in µm; an empty list where it has none."""
+    shape, spacing = (known.get(f"volume.{name}", {}) for name in ("shape", "spacing"))
+    if len(shape) != 3 or len(spacing) != 3:
+        return []
+    return [n * d for n, d in zip(shape.values(), spacing.values(), strict=True)]
+
+
+def _numbers(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:
+    """Each key with its number, or with the numbers of its array by their place in it."""
+    if isinstance(value, dict):
+        for name, below in value.items():
+            yield from _numbers(below, f"{key}.{name}" if key else name)
+    elif isinstance(value, list) and any(isinstance(below, dict) for below in value):
+        for index, below in enumerate(value):
+            yield from _numbers(below, f"{key}[{index}]")
+    else:
+        array = {f"[{i}]": below for i, below in enumerate(value)} if isinstance(value, list) else {"": value}
+        found = {place: float(number) for place, number in array.items() if _is_finite_number(number)}
+        if found:
+            yield key, found
+
+
+def _is_finite_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

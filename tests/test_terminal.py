@@ -1,0 +1,68 @@
+"""Every message reaches every terminal, whatever its encoding."""
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from recon.cli import main
+from recon.report.terminal import write_plainly
+
+MESSAGE = "5 µm, Δn 0.03 … 0.04, 12 × 14, 45°, Größe, \udcff"
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A function that puts a terminal of an encoding in the place of stdout and stderr, and returns its bytes."""
+
+    def put(encoding):
+        raw = io.BytesIO()
+        stream = io.TextIOWrapper(raw, encoding=encoding, write_through=True)
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr(sys, "stderr", stream)
+        return raw
+
+    return put
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shown"),
+    [
+        ("ascii", b"5 um, dn 0.03 ... 0.04, 12 x 14, 45deg, Gr??e, ?"),
+        ("latin-1", "5 µm, dn 0.03 ... 0.04, 12 × 14, 45°, Größe, ?".encode("latin-1")),
+        ("cp1252", "5 µm, dn 0.03 … 0.04, 12 × 14, 45°, Größe, ?".encode("cp1252")),
+        ("utf-8", "5 µm, Δn 0.03 … 0.04, 12 × 14, 45°, Größe, ?".encode()),
+    ],
+)
+def test_what_a_terminal_lacks_is_written_in_plain_letters(terminal, encoding, shown):
+    raw = terminal(encoding)
+    write_plainly()
+    print(MESSAGE)
+    assert raw.getvalue() == shown + b"\n"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
+def test_an_error_reaches_a_terminal_without_its_signs(terminal, encoding, tmp_path):
+    raw = terminal(encoding)
+    config = tmp_path / "Δ µ.toml"
+    assert main(["simulate", str(config), "--out", str(tmp_path)]) == 2
+    assert b"No such file or directory" in raw.getvalue()
+
+
+def test_a_stream_of_another_kind_and_none_stay_as_they_are(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", io.StringIO())
+    monkeypatch.setattr(sys, "stderr", None)
+    write_plainly()
+
+
+def test_the_installed_command_explains_itself_in_ascii(tmp_path):
+    script = Path(sys.executable).with_name("torchdic")
+    for arguments in (["--help"], ["reconstruct", "--help"], ["plan", str(tmp_path / "µ.toml")]):
+        done = subprocess.run(
+            [script, *arguments], capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, check=False
+        )
+        assert b"UnicodeEncodeError" not in done.stderr
+        assert done.returncode in (0, 2)
