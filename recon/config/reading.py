@@ -34,8 +34,9 @@ def load(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
     config = structure(values, Config, str(path))
     if config.data is not None:
-        data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
-        config = dataclasses.replace(config, data=data)
+        given = {"path": config.data.path, "mask": config.data.mask}
+        files = {key: str((path.parent / name).resolve()) for key, name in given.items() if name is not None}
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, **files))
     _warn_of_other_units(config, path)
     return config
 

@@ -96,6 +96,9 @@ class DataSection:
     order: of the polynomial in (y, x) that is fitted to a background.
     gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
         None is one noise for each prism, as it was measured.
+    mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
+        relative path starts from the configuration's folder. None is all pixels.
+    stuck: "auto" looks for pixels of the camera that are dead, hot or stuck at a value; None trusts them all.
     Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite and an order
     below 0.
     """
@@ -107,6 +110,8 @@ class DataSection:
     order: int = 2
     gain: float | None = None
     read_noise: float = 0.0
+    mask: str | None = None
+    stuck: Literal["auto"] | None = "auto"
 
     def __post_init__(self) -> None:
         if self.gain is not None and not (0 < self.gain < math.inf):

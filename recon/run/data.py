@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import torch
 
-from recon.config.schema import Config, ConfigError
+from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
 from recon.misfit.base import spatial_variance
-from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
+from recon.recording.masks import LeftOut, counted_pixels, left_out
+from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
+from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
+from torchdic.files.format import Stack
 from torchdic.files.stack import read_stack
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
@@ -35,12 +38,27 @@ def load_data(config: Config) -> Measured:
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
-    measured = prepare(stack, expected, normalisation)
+    check_counts(stack, expected)
+    measured = prepare(stack, expected, normalisation, _left_out(config, section, stack))
+    counted = measured.left_out.counted
     try:
-        spatial_variance(torch.from_numpy(measured.data))
+        spatial_variance(torch.from_numpy(measured.data), None if counted is None else torch.from_numpy(counted))
     except ValueError as error:
         raise StackError(f"{section.path}: {error}") from error
     return measured
+
+
+def _left_out(config: Config, section: DataSection, stack: Stack) -> LeftOut:
+    """The pixels of a stack that don't count; a line says how many."""
+    mask = None if section.mask is None else read_stack(section.mask).data != 0
+    stuck = None
+    if section.stuck is not None:
+        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:])
+        stuck = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask))
+    found = left_out(stack, mask, stuck)
+    if str(found):
+        print(found)
+    return found
 
 
 def _check_support(config: Config) -> None:

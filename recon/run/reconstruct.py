@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -132,8 +133,13 @@ def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:
         simulation=SimulationSection(),
         reconstruction=replace(config.reconstruction, checkpoint_every=1),
     )
-    digest = hashlib.sha256(measured.data.tobytes()).hexdigest()
-    return "\n".join([*flat(fit), f"misfit = {misfit.name}", f"data's sha256 = {digest}"])
+    digests = {"data": measured.data, "mask": measured.left_out.counted}
+    seen = [f"{name}'s sha256 = {_digest(array)}" for name, array in digests.items() if array is not None]
+    return "\n".join([*flat(fit), f"misfit = {misfit.name}", *seen])
+
+
+def _digest(array: np.ndarray) -> str:
+    return hashlib.sha256(array.tobytes()).hexdigest()
 
 
 def _checkpoint_to_resume(saved: Path, identity: str, *, resume: bool, restart: bool) -> Checkpoint | None:
