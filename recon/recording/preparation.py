@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 
 from recon.recording.background import background_surface, known_levels, noise_level
 from recon.recording.masks import LeftOut, median_of_known, nearest_counted
@@ -21,7 +21,13 @@ _SATURATED = 0.01  # a larger fraction of saturated pixels is warned of
 
 _EXTINCT = 1e-3  # where the empty field should be darker than this, stray light and dark counts are brighter than it
 
-_BRIGHT = 1.5  # a background brighter than this many empty bright fields is warned of; none should exceed 1
+_BRIGHT = 1.5  # an extinct prism's background brighter than this many empty bright fields is warned of
+
+# A float stack's background that differs from the model's by a larger part of it is warned of. A bias that is 10° off
+# changes the background at bias π/2 by 17 %.
+_LEVEL = 0.25
+
+_NOTHING = 0.01  # a background below this part of the model's can't be scaled by
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,7 @@ class PrismReport:
     bias: rad; None for bright field.
     background: mean of the background in the file's unit, offset removed.
     scale: the file's unit per empty bright field; the images were divided by it.
+    flicker: standard deviation of the images' medians over their mean; None where that isn't above 0.
     unevenness: of the background that was flattened, peak to peak, relative to its mean; 0 where none was flattened.
     noise: standard deviation of the noise, relative to the empty bright field; None for images of less than 3 × 3
         pixels, which are too small to tell.
@@ -99,6 +106,7 @@ class PrismReport:
     bias: float | None
     background: float
     scale: float
+    flicker: float | None
     unevenness: float
     noise: float | None
 
@@ -143,7 +151,7 @@ def prepare(
     Raises StackError where the number of prisms, planes or pixels is not the expected one, no pixel size is known, the
     scale should come from a background at extinction, or a background that divides the images is not above 0.
     Warns StackWarning where the file's sizes differ from the expected ones by more than 1 %, more than 1 % of the
-    pixels are saturated, or floats look like counts.
+    pixels are saturated, or the background of floats isn't the expected one.
     """
     normalisation = normalisation or Normalisation()
     _check_normalisation(stack, normalisation)
@@ -204,10 +212,18 @@ def _in_model_unit(
         bias=bias,
         background=level,
         scale=unit,
+        flicker=_flicker(known, offset),
         unevenness=float(np.ptp(surface)) / abs(level) if flatten and level else 0.0,
         noise=None if noise is None else noise / unit,
     )
     return scaled, report
+
+
+def _flicker(images: Real[np.ndarray, "focus y x"], offset: float) -> float | None:
+    """How much the images' brightness differs from one to the next, relative to their mean."""
+    medians = [np.nanmedian(image) - offset for image in images if np.isfinite(image).any()]
+    mean = float(np.mean(medians))
+    return float(np.std(medians)) / mean if mean > 0 else None
 
 
 def _ideal_empty_field(bias: float | None) -> float:
@@ -287,16 +303,25 @@ def _check_saturation(stack: Stack) -> None:
 
 
 def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequence[float]) -> None:
-    """Warn where a background is too bright to be relative to the empty bright field."""
+    """Warn where a background isn't the model's: floats may have been scaled, or their background subtracted."""
     for prism, (report, expected) in enumerate(zip(reports, levels, strict=True)):
         found = report.background / report.scale
-        if found > _BRIGHT:
-            warnings.warn(
-                f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g}: "
-                "float pixels count as relative to the empty bright field unless a scale is given",
-                StackWarning,
-                stacklevel=3,
+        # an extinct field is as bright as its stray light, of which the model knows nothing
+        if found <= _BRIGHT if expected < _EXTINCT else abs(found - expected) <= _LEVEL * expected:
+            continue
+        if found > _NOTHING * expected:
+            advice = "data.scale = 'background' scales by it"
+        else:
+            advice = (
+                "it seems to have been subtracted: data.offset = -(its level) puts it back, after which "
+                "data.scale = 'background' scales by it"
             )
+        warnings.warn(
+            f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g} as the model's: float pixels "
+            f"count as relative to the empty bright field unless a scale is given; {advice}",
+            StackWarning,
+            stacklevel=3,
+        )
 
 
 def _differ(found: float, wanted: float) -> bool:
