@@ -3,7 +3,7 @@ method.
 
     python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
     python benchmarks/reconstruction.py ablation [NAME ...] [--cache DIR]
-    python benchmarks/reconstruction.py nuisances | propagations | methods | stuck [--cache DIR]
+    python benchmarks/reconstruction.py nuisances | propagations | methods | stuck | support [--cache DIR]
 
 "error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
 misfit over what noise alone leaves, for a clean stack the misfit itself. Seconds are processor seconds of one thread.
@@ -22,6 +22,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 import scenes
@@ -39,6 +40,7 @@ from recon.recording.cut_field import needed_margin
 from recon.recording.masks import LeftOut, left_out
 from recon.recording.preparation import ExpectedStack, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
+from recon.recording.support import edges_support
 from recon.report.metrics import volume_error
 from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
 from scenes import Scene
@@ -89,8 +91,12 @@ def fit(
     fidelity: Fidelity | None = None,
     setup: Setup | None = None,
     mask: Tensor | None = None,
+    support: Tensor | None = None,
 ) -> Found:
-    """Fit a scene by a recipe; None is the default one, at the recommended fidelity. mask: the pixels that count."""
+    """Fit a scene by a recipe; None is the default one, at the recommended fidelity.
+
+    mask: the pixels that count. support: the voxels in which Δn is sought.
+    """
     recipe = replace(recipe or Recipe(), bounds=Bounds(*scene.bounds))
     usual = RECOMMENDED if recipe.method == "newton" else RECOMMENDED_FOR_ADAM
     began = time.process_time()
@@ -99,7 +105,9 @@ def fit(
     def misfit(data: Tensor) -> GaussianMisfit:
         return GaussianMisfit(data, mask=mask)
 
-    problem = Problem.from_recipe(scene.data, setup or setup_of(scene), fidelity or usual, recipe, misfit, noise)
+    problem = Problem.from_recipe(
+        scene.data, setup or setup_of(scene), fidelity or usual, recipe, misfit, noise, support
+    )
     last = None
     for step in minimise(problem):
         last = step
@@ -221,6 +229,30 @@ def stuck(options: argparse.Namespace) -> None:
         print(row(f"{seen.stuck or 14} stuck pixels, {name}", fit(cleaned, mask=mask)), flush=True)
 
 
+def support(options: argparse.Namespace) -> None:
+    """Scenes with Δn sought everywhere, within the edges in focus, and within the truth widened by one voxel.
+
+    "held": the error where the priors' weight is held at the last one of the fit without a support.
+    """
+    print("| scene | support | share | lost | error | held | mass | misfit/noise | tv |\n" + "|---" * 9 + "|")
+    for name in options.names or ("two beads", "cell", "bead", "cell, 400 photons"):
+        scene, usual = scenes.scene(name, options.cache), Recipe(method=options.method)
+        focus, true = [float(z) for z in scene.acquisition.focus], (scene.truth != 0).numpy()
+        edges = edges_support(scene.data.numpy(), focus, scene.grid, scene.microscope)
+        known = np.asarray(ndimage.binary_dilation(true, np.ones((3, 3, 3), bool)), bool)
+        everywhere, held = np.ones(true.shape, bool), usual
+        for kind, voxels in (("none", everywhere), ("edges", edges), ("the truth's, widened by a voxel", known)):
+            within = torch.from_numpy(voxels)
+            found = fit(scene, usual, support=within)
+            weight = found.last.weights[-1]["tv"]
+            if kind == "none":
+                held = replace(usual, tv=(weight, weight), l1=usual.sparse * weight)
+            parts = (float(voxels.mean()), float((true & ~voxels).sum() / true.sum()), found.error)
+            numbers = [f"{number:.3f}" for number in (*parts, fit(scene, held, support=within).error)]
+            numbers += [f"{found.mass:.2f}", f"{found.misfit:.3f}", f"{weight:.0f}"]
+            print("| " + " | ".join((name, kind, *numbers)) + " |", flush=True)
+
+
 def propagations(options: argparse.Namespace) -> None:
     """Rays and projection alone, by both methods."""
     print(HEAD)
@@ -267,6 +299,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "propagations": propagations,
     "methods": methods,
     "stuck": stuck,
+    "support": support,
 }
 
 

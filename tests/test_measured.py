@@ -141,9 +141,8 @@ def test_floats_of_another_background_than_the_models_are_warned_of_both_ways(ch
     said = rf"stack\.tif: prism 0's background is {found}, not 0\.5 as the model's.*data\.scale = 'background'"
     with pytest.warns(StackWarning, match=said):
         prepared(stack, [RIGHT], range(3), (0.1, 0.1))
-    ready = prepared(
-        stack, [RIGHT], range(3), (0.1, 0.1), scale="background", offset=0.0 if change(0.5) > 0 else -0.5
-    )
+    back = 0.0 if change(0.5) > 0 else -0.5
+    ready = prepared(stack, [RIGHT], range(3), (0.1, 0.1), scale="background", offset=back)
     assert ready.data[0] == pytest.approx(data[0], rel=1e-6)
 
 

@@ -37,6 +37,10 @@ def load(path: str | os.PathLike[str]) -> Config:
         given = {"path": config.data.path, "mask": config.data.mask}
         files = {key: str((path.parent / name).resolve()) for key, name in given.items() if name is not None}
         config = dataclasses.replace(config, data=dataclasses.replace(config.data, **files))
+    support = config.reconstruction.support
+    if support not in (None, "edges"):
+        section = dataclasses.replace(config.reconstruction, support=str((path.parent / support).resolve()))
+        config = dataclasses.replace(config, reconstruction=section)
     _warn_of_other_units(config, path)
     return config
 

@@ -133,11 +133,15 @@ class ReconstructionSection(Recipe):
     checkpoint_every: steps between two checkpoints.
     margin: voxels of specimen beyond the field of the images on each side, which the light from there asks for; "auto"
         adds them where the images show the specimen at their border.
+    support: where Δn is sought; elsewhere it is 0. "edges" finds it from the edges in each focus plane; or the file of
+        a mask, (z, y, x) or (y, x), 0 where there is none; a relative path starts from the configuration's folder.
+        None is everywhere.
     Raises ValueError where a value breaks its law.
     """
 
     checkpoint_every: int = 10
     margin: int | Literal["auto"] = "auto"
+    support: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

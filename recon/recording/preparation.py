@@ -317,8 +317,8 @@ def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequ
                 "data.scale = 'background' scales by it"
             )
         warnings.warn(
-            f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g} as the model's: float pixels "
-            f"count as relative to the empty bright field unless a scale is given; {advice}",
+            f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g} as the model's: float "
+            f"pixels count as relative to the empty bright field unless a scale is given; {advice}",
             StackWarning,
             stacklevel=3,
         )

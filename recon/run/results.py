@@ -76,6 +76,8 @@ def metrics(
         found["weights"] = [{k: _known(v) for k, v in record.items()} for record in last.weights]
     if problem.setup.margin > 0:
         found["margin"] = problem.setup.margin
+    if problem.support is not None:
+        found["support"] = {"share": float(problem.support.float().mean())}
     if last.plans:
         found["plans"] = list(last.plans)
     return found
