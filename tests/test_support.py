@@ -2,7 +2,7 @@
 
 import io
 import json
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.support import edges_support
+from recon.run import recorded
 from recon.run.room import held_beside_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.files.stack import read_volume, write_stack
@@ -30,7 +31,7 @@ FIDELITY = Fidelity("wave", sources=6, order=1)
 BEAD = Bead(0.9, 0.02, 1.45, (0.2, 0.3, -0.6))
 
 
-def recorded(bead=BEAD, noise=0.005):
+def images_of(bead=BEAD, noise=0.005):
     with torch.no_grad():
         images = image(Volume(GRID, bead.delta(GRID, dtype=torch.float32), 1.45), MICROSCOPE, ACQUISITION, FIDELITY)
     return images + noise * torch.randn(images.shape, generator=torch.Generator().manual_seed(0))
@@ -48,7 +49,7 @@ def fitted(data, support, method, steps=6, **recipe):
 
 @pytest.fixture(scope="module")
 def data():
-    return recorded()
+    return images_of()
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +113,7 @@ def test_in_a_margin_the_support_goes_on(data, half):
 def test_the_support_of_edges_holds_the_specimen_and_is_smaller_than_the_volume(centre, noise):
     """Also of one that the field's edge cuts."""
     bead = Bead(0.9, 0.04, 1.45, centre)
-    support = edges_support(recorded(bead, noise).numpy(), FOCUS, GRID, MICROSCOPE)
+    support = edges_support(images_of(bead, noise).numpy(), FOCUS, GRID, MICROSCOPE)
     assert bool(support[bead.delta(GRID).numpy() > 0].all())
     assert support.mean() < 0.7
 
@@ -182,6 +183,19 @@ def test_edges_are_the_support_where_asked_for(run, data):
     assert bool((found[~torch.from_numpy(support)] == 0).all())
     assert metrics["support"]["share"] == pytest.approx(support.mean())
     assert "support" not in run()[4]
+
+
+def test_another_support_is_another_descent(run, half, monkeypatch):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    mask = half.numpy().astype(np.uint8)
+    monkeypatch.setattr(recorded, "signals_kept", lambda: nullcontext(interrupted))
+    assert run(support="mask.tif", mask=mask)[0] == 130
+    mask[5, 6, 7] = 0
+    code, _, err, *_ = run("--resume", support="mask.tif", mask=mask)
+    assert code == 2
+    assert "support's sha256 was" in err
 
 
 @pytest.mark.parametrize("shape", [(8, 30, 32), (4, 32, 30), (30, 32), (2, 8, 32, 30)])
