@@ -113,7 +113,7 @@ def test_a_focus_step_means_nothing_to_one_plane():
 
 
 def test_floats_are_left_alone():
-    data = np.random.default_rng(0).uniform(0.1, 1.2, (2, 3, 8, 6)) * tilted((8, 6))
+    data = np.random.default_rng(0).uniform(0.6, 1.4, (2, 3, 8, 6)) * tilted((8, 6))
     ready = prepared(Stack(data), [0.0, None], range(3), (0.1, 0.1))
     assert ready.data.dtype == np.float32
     assert np.array_equal(ready.data, data.astype(np.float32))
@@ -127,6 +127,38 @@ def test_floats_that_look_like_counts_are_warned_of():
         prepared(stack, [RIGHT], [0.0], (0.1, 0.1))
     assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale=2468.0).data == pytest.approx(0.5)
     assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale="background").data == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [(lambda s: 2 * s, "1"), (lambda s: s - 0.5, "0"), (lambda s: s / 16, "0.03125"), (lambda s: 1.3 * s, "0.65")],
+)
+def test_floats_of_another_background_than_the_models_are_warned_of_both_ways(change, found):
+    """A flat field divided out, a background subtracted, counts as parts of a camera's full scale."""
+    data = np.full((1, 3, 12, 16), 0.5)
+    data[0, 1, 4:7, 5:9] = 0.8
+    stack = Stack(change(data), source="stack.tif")
+    said = rf"stack\.tif: prism 0's background is {found}, not 0\.5 as the model's.*data\.scale = 'background'"
+    with pytest.warns(StackWarning, match=said):
+        prepared(stack, [RIGHT], range(3), (0.1, 0.1))
+    back = 0.0 if change(0.5) > 0 else -0.5
+    ready = prepared(stack, [RIGHT], range(3), (0.1, 0.1), scale="background", offset=back)
+    assert ready.data[0] == pytest.approx(data[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("bias", [math.radians(80), math.radians(100)])
+def test_floats_of_a_bias_that_is_a_little_off_are_not_warned_of(bias):
+    prepared(Stack(np.full((1, 1, 12, 16), 0.5)), [bias], [0.0], (0.1, 0.1))
+
+
+def test_flicker_is_that_of_the_images_medians():
+    camera, _ = counts(planes=4)
+    lamp = np.array([1.0, 1.1, 0.9, 1.0])
+    data = ((camera - 100.0) * lamp[:, None, None])[None]
+    ready = prepared(Stack(data), [RIGHT], range(4), (0.1, 0.1), scale="background")
+    assert ready.prisms[0].flicker == pytest.approx(np.std(lamp), abs=0.004)
+    dark = prepared(Stack(np.full((1, 2, 8, 8), -1.0)), [0.0], range(2), (0.1, 0.1))
+    assert dark.prisms[0].flicker is None
 
 
 @pytest.mark.parametrize("bias", [None, math.pi, RIGHT, -RIGHT, 0.5])

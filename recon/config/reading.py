@@ -38,8 +38,13 @@ def load(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: {wrong}")
     config = structure(values, Config, str(path))
     if config.data is not None:
-        data = dataclasses.replace(config.data, path=str((path.parent / config.data.path).resolve()))
-        config = dataclasses.replace(config, data=data)
+        given = {"path": config.data.path, "mask": config.data.mask}
+        files = {key: str((path.parent / name).resolve()) for key, name in given.items() if name is not None}
+        config = dataclasses.replace(config, data=dataclasses.replace(config.data, **files))
+    support = config.reconstruction.support
+    if support not in (None, "edges"):
+        section = dataclasses.replace(config.reconstruction, support=str((path.parent / support).resolve()))
+        config = dataclasses.replace(config, reconstruction=section)
     _warn_of_long_shears(config, path)
     return config
 

@@ -97,6 +97,9 @@ class DataSection:
     gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
         None is one noise for each prism, as it was measured.
     series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
+    mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
+        relative path starts from the configuration's folder. None is all pixels.
+    stuck: "auto" looks for pixels of the camera that are dead, hot or stuck at a value; None trusts them all.
     Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
     or a series below 0.
     """
@@ -109,6 +112,8 @@ class DataSection:
     gain: float | None = None
     read_noise: float = 0.0
     series: int | None = None
+    mask: str | None = None
+    stuck: Literal["auto"] | None = "auto"
 
     def __post_init__(self) -> None:
         if self.gain is not None and not (0 < self.gain < math.inf):
@@ -132,11 +137,15 @@ class ReconstructionSection(Recipe):
     checkpoint_every: steps between two checkpoints.
     margin: voxels of specimen beyond the field of the images on each side, which the light from there asks for; "auto"
         adds them where the images show the specimen at their border.
+    support: where Δn is sought; elsewhere it is 0. "edges" finds it from the edges in each focus plane; or the file of
+        a mask, (z, y, x) or (y, x), 0 where there is none; a relative path starts from the configuration's folder.
+        None is everywhere.
     Raises ValueError where a value breaks its law.
     """
 
     checkpoint_every: int = 10
     margin: int | Literal["auto"] = "auto"
+    support: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,7 +24,8 @@ def solved_directly(
     """
     started, data = time.perf_counter(), problem.misfit.data
     if recipe.method == "linear":
-        found = tikhonov(data, problem.setup, noise, recipe.bounds)
+        index = next(u for u in problem.unknowns if isinstance(u, IndexDifference))
+        found = tikhonov(data, problem.setup, noise, index.bounds)
         sections = None
     else:
         found = path_length(data, problem.setup, noise)

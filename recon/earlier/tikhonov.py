@@ -201,13 +201,13 @@ def _within(
     steepest: greatest eigenvalue of AᵀA. A. Beck and M. Teboulle, SIAM J. Imaging Sci. 2, 183 (2009); B. O'Donoghue
     and E. Candès, Found. Comput. Math. 15, 715 (2015), for beginning anew.
     """
-    x = start.clamp(bounds.lower, bounds.upper)
+    x = bounds.clamped(start)
     if math.isinf(weight):
         return x
     ahead, momentum = x, 1.0
     for _ in range(_STEPS):
         gradient = model.adjoint(model.images(ahead) - d) + weight * ahead
-        moved = (ahead - gradient / (steepest + weight)).clamp(bounds.lower, bounds.upper)
+        moved = bounds.clamped(ahead - gradient / (steepest + weight))
         if float(((ahead - moved) * (moved - x)).sum()) > 0:
             momentum = 1.0
         following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2

@@ -1,10 +1,11 @@
 """Δn within bounds, as a smooth function of a parameter that may take any value."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool
 from torch import Tensor
 
 # Sharpness of softplus: its knee is about 1/200 = 0.005 wide, the scale of a cell's Δn.
@@ -56,6 +57,30 @@ class Bounds:
         if upper is not None:
             return -_inverse_softplus((upper - delta).clamp_min(margin))
         return delta.clone()
+
+
+@dataclass(frozen=True, eq=False)
+class SupportedBounds(Bounds):
+    """Bounds within a support; outside Δn is 0, whatever they are.
+
+    support: the voxels (z, y, x) in which Δn is sought (True). Outside, a parameter has no gradient.
+    Raises ValueError where the support holds no voxel.
+    """
+
+    support: Bool[Tensor, "z y x"] = field(default_factory=lambda: torch.ones(1, 1, 1, dtype=torch.bool))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not bool(self.support.any()):
+            raise ValueError("the support holds no voxel: there is nothing to fit")
+
+    def delta(self, parameter: Tensor) -> Tensor:
+        """Δn of a parameter of any value; 0 outside the support."""
+        return torch.where(self.support, super().delta(parameter), 0)
+
+    def clamped(self, delta: Tensor) -> Tensor:
+        """Δn moved to the nearest value within the bounds; 0 outside the support."""
+        return torch.where(self.support, super().clamped(delta), 0)
 
 
 def _inverse_softplus(value: Tensor) -> Tensor:

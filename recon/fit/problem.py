@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import torch.nn.functional as F
+from jaxtyping import Bool
 from torch import Tensor
 
-from recon.fit.bounds import Bounds
+from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.nuisances.brightness import Brightness, RelativeBrightness
 from recon.fit.nuisances.named import NUISANCES
 from recon.fit.planned import GivenFidelity, PlannedFidelity
@@ -148,6 +150,14 @@ class Problem:
         if len(set(names)) < len(names):
             raise ValueError(f"two unknowns share a name: {', '.join(names)}")
 
+    @property
+    def support(self) -> Bool[Tensor, "z y x"] | None:
+        """The voxels in which Δn is sought; None is all."""
+        for unknown in self.unknowns:
+            if isinstance(unknown, IndexDifference) and isinstance(unknown.bounds, SupportedBounds):
+                return unknown.bounds.support
+        return None
+
     @classmethod
     def from_recipe(
         cls,
@@ -157,12 +167,15 @@ class Problem:
         recipe: Recipe,
         misfit: Callable[[Tensor], Misfit] = GaussianMisfit,
         noise: Sequence[float] | None = None,
+        support: Bool[Tensor, "z y x"] | None = None,
     ) -> "Problem":
         """The problem of finding Δn as a recipe says.
 
         data: (prism, focus, y, x), relative to the empty bright field. fidelity: of the modelled images, or a tolerance
         for which one is planned. misfit: makes one from the data. noise: standard deviation of the noise in each
-        prism's images, in the unit of the data; None is measured in them.
+        prism's images, in the unit of the data; None is measured in them. support: the voxels of the field in which Δn
+        is sought (True), beyond which it is 0; None is all. In a margin it goes on as at the field's edge.
+        Raises ValueError where the support isn't of the field's shape or holds no voxel, and as the class does.
         """
         made = misfit(data)
         if isinstance(fidelity, Fidelity):
@@ -174,8 +187,19 @@ class Problem:
             levels = measured_noise(data, made.mask) if noise is None else list(noise)
             known = made.of_noise(levels) if made.knows_all else None
             weight = FollowsNoise(known, int(made.pixels.sum()))
+        if support is not None:
+            recipe = replace(recipe, bounds=_supported(recipe.bounds, support.to(data.device), setup))
         unknowns, priors = recipe.unknowns(), recipe.priors()
         return cls(setup, made, unknowns, priors, careful, recipe.most_steps, recipe.descent, weight)
+
+
+def _supported(bounds: Bounds, support: Bool[Tensor, "z y x"], setup: Setup) -> SupportedBounds:
+    """Bounds within a support of the field, which goes on in the margin."""
+    if tuple(support.shape) != setup.field.shape:
+        raise ValueError(f"the support has shape {tuple(support.shape)}, the field {setup.field.shape} (z, y, x)")
+    if setup.margin > 0:
+        support = F.pad(support[None].float(), (setup.margin,) * 4, mode="replicate")[0] > 0
+    return SupportedBounds(bounds.lower, bounds.upper, support)
 
 
 def measured_noise(data: Tensor, mask: Tensor | None = None) -> list[float] | None:

@@ -16,7 +16,7 @@ NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
 def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[np.ndarray, "y x"]:
     """The slow background of an image: a polynomial surface of total degree `order`.
 
-    image: (y, x), in any unit.
+    image: (y, x), in any unit. Pixels that are NaN are left out; at least one must not be.
     order: 0 is a constant, 1 a tilted plane, 2 a curved surface.
 
     Returns the surface (y, x) in the image's unit, float64. It is fitted to the means of blocks of pixels by least
@@ -24,10 +24,12 @@ def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[
     longer change. A specimen that stands out of the noise and leaves most of the field empty hardly bends it.
     """
     values, rows, columns = _block_means(image)
-    middle = float(np.median(values))  # subtracted to keep digits where a bright background is nearly flat
+    middle = float(np.nanmedian(values))  # subtracted to keep digits where a bright background is nearly flat
     values -= middle
     basis = _polynomials(rows, columns, image.shape, order)
     basis = basis.reshape(len(basis), -1).T
+    known = np.isfinite(values)
+    basis, values = basis[known], values[known]
     rounding = 100 * np.finfo(np.float64).eps * max(abs(middle), float(np.abs(values).max()))
     coefficients = _robust_fit(basis, values, rounding)
     ny, nx = image.shape
@@ -36,12 +38,20 @@ def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[
 
 
 def _block_means(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means of equal blocks of pixels, row by row, and the pixel indices of the blocks' centres along y and x."""
+    """Means of equal blocks of pixels, row by row, and the pixel indices of the blocks' centres along y and x.
+
+    The mean of a block without any known pixel is NaN.
+    """
     by, bx = (math.ceil(n / _BLOCKS) for n in image.shape)
     ky, kx = image.shape[0] // by, image.shape[1] // bx
     blocks = image[: ky * by, : kx * bx].astype(np.float64).reshape(ky, by, kx, bx)
     rows, columns = (np.arange(ky) + 0.5) * by - 0.5, (np.arange(kx) + 0.5) * bx - 0.5
-    return blocks.mean(axis=(1, 3)).ravel(), rows, columns
+    known = np.isfinite(blocks)
+    if known.all():
+        return blocks.mean(axis=(1, 3)).ravel(), rows, columns
+    number = known.sum(axis=(1, 3))
+    totals = np.where(known, blocks, 0).sum(axis=(1, 3))
+    return np.where(number > 0, totals / np.maximum(number, 1), np.nan).ravel(), rows, columns
 
 
 def _robust_fit(basis: np.ndarray, values: np.ndarray, rounding: float) -> np.ndarray:

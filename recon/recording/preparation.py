@@ -3,14 +3,15 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Real
 
 from recon.recording.background import background_surface, known_levels, noise_level
+from recon.recording.masks import LeftOut, median_of_known, nearest_counted
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
 
@@ -20,7 +21,13 @@ _SATURATED = 0.01  # a larger fraction of saturated pixels is warned of
 
 _EXTINCT = 1e-3  # where the empty field should be darker than this, stray light and dark counts are brighter than it
 
-_BRIGHT = 1.5  # a background brighter than this many empty bright fields is warned of; none should exceed 1
+_BRIGHT = 1.5  # an extinct prism's background brighter than this many empty bright fields is warned of
+
+# A float stack's background that differs from the model's by a larger part of it is warned of. A bias that is 10° off
+# changes the background at bias π/2 by 17 %.
+_LEVEL = 0.25
+
+_NOTHING = 0.01  # a background below this part of the model's can't be scaled by
 
 
 @dataclass(frozen=True)
@@ -90,6 +97,7 @@ class PrismReport:
     bias: rad; None for bright field.
     background: mean of the background in the file's unit, offset removed.
     scale: the file's unit per empty bright field; the images were divided by it.
+    flicker: standard deviation of the images' medians over their mean; None where that isn't above 0.
     unevenness: of the background that was flattened, peak to peak, relative to its mean; 0 where none was flattened.
     noise: standard deviation of the noise, relative to the empty bright field; None for images of less than 3 × 3
         pixels, which are too small to tell.
@@ -98,6 +106,7 @@ class PrismReport:
     bias: float | None
     background: float
     scale: float
+    flicker: float | None
     unevenness: float
     noise: float | None
 
@@ -110,12 +119,14 @@ class Measured:
     focus: one per plane, µm.
     pixel_size: (y, x) in µm.
     prisms: one report per prism.
+    left_out: the pixels that don't count, and why. In the data they have the value of the nearest one that does.
     """
 
     data: Float[np.ndarray, "prism focus y x"]
     focus: tuple[float, ...]
     pixel_size: tuple[float, float]
     prisms: tuple[PrismReport, ...]
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @property
     def noise(self) -> list[float] | None:
@@ -123,41 +134,55 @@ class Measured:
         return known_levels(report.noise for report in self.prisms)
 
 
-def prepare(stack: Stack, expected: ExpectedStack, normalisation: Normalisation | None = None) -> Measured:
+def prepare(
+    stack: Stack,
+    expected: ExpectedStack,
+    normalisation: Normalisation | None = None,
+    left_out: LeftOut | None = None,
+) -> Measured:
     """Check a stack against the acquisition and bring it to the model's unit, the empty bright field.
 
     stack: as read from its file.
     expected: what the acquisition says that the stack holds.
     normalisation: how pixel values become intensities; None is `Normalisation()`, which flattens and scales integers
         by their background and leaves floats as they are.
+    left_out: the pixels that don't count; nothing that is found in the images depends on them. None is none.
 
     Raises StackError where the number of prisms, planes or pixels is not the expected one, no pixel size is known, the
     scale should come from a background at extinction, or a background that divides the images is not above 0.
     Warns StackWarning where the file's sizes differ from the expected ones by more than 1 %, more than 1 % of the
-    pixels are saturated, or floats look like counts.
+    pixels are saturated, or the background of floats isn't the expected one.
     """
     normalisation = normalisation or Normalisation()
     _check_normalisation(stack, normalisation)
-    _check_counts(stack, expected)
+    check_counts(stack, expected)
     pixel_size = _agreed_pixel_size(stack, expected.pixel_size)
     _compare_focus(stack, expected.focus)
     _check_saturation(stack)
-    levels = expected.empty_levels
+    levels, left_out = expected.empty_levels, left_out or LeftOut()
     prepared = [
-        _in_model_unit(stack, prism, bias, level, normalisation)
+        _in_model_unit(stack, prism, (bias, level), normalisation, left_out.counted)
         for prism, (bias, level) in enumerate(zip(expected.biases, levels, strict=True))
     ]
     reports = tuple(report for _, report in prepared)
     if not stack.is_integer:
         _check_brightness(stack, reports, levels)
-    return Measured(np.stack([images for images, _ in prepared]), expected.focus, pixel_size, reports)
+    return Measured(np.stack([images for images, _ in prepared]), expected.focus, pixel_size, reports, left_out)
 
 
 def _in_model_unit(
-    stack: Stack, prism: int, bias: float | None, expected: float, normalisation: Normalisation
+    stack: Stack,
+    prism: int,
+    empty: tuple[float | None, float],
+    normalisation: Normalisation,
+    counted: Bool[np.ndarray, "prism focus y x"] | None,
 ) -> tuple[Float[np.ndarray, "focus y x"], PrismReport]:
-    """One prism's images relative to the empty bright field, float32. expected: the empty field's intensity."""
-    images, label = stack.data[prism], f"{stack.source}: prism {prism}"
+    """One prism's images relative to the empty bright field, float32. empty: its bias, and the empty field's intensity.
+
+    counted: the pixels that count; None is all.
+    """
+    images, label, (bias, expected) = stack.data[prism], f"{stack.source}: prism {prism}", empty
+    known = images if counted is None else np.where(counted[prism], images, np.nan)
     flatten, scale, offset = normalisation.flattens(stack), normalisation.scale_of(stack), normalisation.offset
     is_extinct = expected < _EXTINCT
     if scale == "background" and is_extinct:
@@ -167,7 +192,7 @@ def _in_model_unit(
             "too dark to scale by; give scale, the counts per empty bright field"
         )
     # the lamp does not change while the specimen moves through focus: one surface serves all planes
-    surface = background_surface(np.median(images, axis=0) - offset, normalisation.order if flatten else 0)
+    surface = background_surface(median_of_known(known) - offset, normalisation.order if flatten else 0)
     level, lowest = float(surface.mean()), float(surface.min())
     if lowest <= 0 and (scale == "background" or (flatten and not is_extinct)):
         raise StackError(
@@ -177,19 +202,28 @@ def _in_model_unit(
     unit = level / expected if scale == "background" else scale
     scaled = np.empty(images.shape, np.float32)
     for plane, image in enumerate(images):
-        light = image.astype(np.float64) - offset
+        sound = image if counted is None else nearest_counted(image, counted[prism, plane])
+        light = sound.astype(np.float64) - offset
         if flatten:
             light = light - surface + expected * unit if is_extinct else light * (level / surface)
         scaled[plane] = light / unit
-    noise = noise_level(images)
+    noise = noise_level(known)
     report = PrismReport(
         bias=bias,
         background=level,
         scale=unit,
+        flicker=_flicker(known, offset),
         unevenness=float(np.ptp(surface)) / abs(level) if flatten and level else 0.0,
         noise=None if noise is None else noise / unit,
     )
     return scaled, report
+
+
+def _flicker(images: Real[np.ndarray, "focus y x"], offset: float) -> float | None:
+    """How much the images' brightness differs from one to the next, relative to their mean."""
+    medians = [np.nanmedian(image) - offset for image in images if np.isfinite(image).any()]
+    mean = float(np.mean(medians))
+    return float(np.std(medians)) / mean if mean > 0 else None
 
 
 def _ideal_empty_field(bias: float | None) -> float:
@@ -206,7 +240,7 @@ def _check_normalisation(stack: Stack, normalisation: Normalisation) -> None:
         raise StackError(f"{stack.source}: background order {normalisation.order} must be at least 0")
 
 
-def _check_counts(stack: Stack, expected: ExpectedStack) -> None:
+def check_counts(stack: Stack, expected: ExpectedStack) -> None:
     """Raise StackError where the prisms, planes or pixels are not as many as expected."""
     held, prisms, planes = stack.data.shape, len(expected.biases), len(expected.focus)
     if held[:2] != (prisms, planes):
@@ -269,16 +303,25 @@ def _check_saturation(stack: Stack) -> None:
 
 
 def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequence[float]) -> None:
-    """Warn where a background is too bright to be relative to the empty bright field."""
+    """Warn where a background isn't the model's: floats may have been scaled, or their background subtracted."""
     for prism, (report, expected) in enumerate(zip(reports, levels, strict=True)):
         found = report.background / report.scale
-        if found > _BRIGHT:
-            warnings.warn(
-                f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g}: "
-                "float pixels count as relative to the empty bright field unless a scale is given",
-                StackWarning,
-                stacklevel=3,
+        # an extinct field is as bright as its stray light, of which the model knows nothing
+        if found <= _BRIGHT if expected < _EXTINCT else abs(found - expected) <= _LEVEL * expected:
+            continue
+        if found > _NOTHING * expected:
+            advice = "data.scale = 'background' scales by it"
+        else:
+            advice = (
+                "it seems to have been subtracted: data.offset = -(its level) puts it back, after which "
+                "data.scale = 'background' scales by it"
             )
+        warnings.warn(
+            f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g} as the model's: float "
+            f"pixels count as relative to the empty bright field unless a scale is given; {advice}",
+            StackWarning,
+            stacklevel=3,
+        )
 
 
 def _differ(found: float, wanted: float) -> bool:

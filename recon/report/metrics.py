@@ -1,5 +1,6 @@
 """Numbers that say how good a reconstruction is."""
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -14,6 +15,16 @@ def mean_inside(delta: Float[Tensor, "z y x"], inside: Bool[Tensor, "z y x"]) ->
     return float(delta[inside].mean())
 
 
-def residual_rms(images: Float[Tensor, "prism focus y x"], data: Float[Tensor, "prism focus y x"]) -> list[float]:
-    """The rms difference between model and data for each prism setting, in units of the empty bright field."""
-    return (images - data).square().mean((1, 2, 3)).sqrt().tolist()
+def residual_rms(
+    images: Float[Tensor, "prism focus y x"],
+    data: Float[Tensor, "prism focus y x"],
+    mask: Bool[Tensor, "prism focus y x"] | None = None,
+) -> list[float]:
+    """The rms difference between model and data for each prism setting, in units of the empty bright field.
+
+    mask: the pixels that count (True); None is all.
+    """
+    squares = (images - data).square()
+    if mask is None:
+        return squares.mean((1, 2, 3)).sqrt().tolist()
+    return (torch.where(mask, squares, 0).sum((1, 2, 3)) / mask.sum((1, 2, 3))).sqrt().tolist()

@@ -2,14 +2,20 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from torch import Tensor
 
-from recon.config.schema import Config, ConfigError
+from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
 from recon.misfit.base import spatial_variance
-from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
+from recon.recording.masks import LeftOut, counted_pixels, left_out
+from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
+from recon.recording.stuck_pixels import sharpest, stuck_pixels
+from recon.recording.support import edges_support
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
+from torchdic.files.format import Stack
 from torchdic.files.stack import read_stack
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
@@ -24,7 +30,7 @@ def load_data(config: Config) -> Measured:
     """
     if config.data is None:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
-    _check_support(config)
+    _check_feasible(config)
     section = config.data
     stack = read_stack(section.path, section.series)
     expected = ExpectedStack(
@@ -35,15 +41,52 @@ def load_data(config: Config) -> Measured:
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
-    measured = prepare(stack, expected, normalisation)
+    check_counts(stack, expected)
+    measured = prepare(stack, expected, normalisation, _left_out(config, section, stack))
+    counted = measured.left_out.counted
     try:
-        spatial_variance(torch.from_numpy(measured.data))
+        spatial_variance(torch.from_numpy(measured.data), None if counted is None else torch.from_numpy(counted))
     except ValueError as error:
         raise StackError(f"{section.path}: {error}") from error
     return measured
 
 
-def _check_support(config: Config) -> None:
+def _left_out(config: Config, section: DataSection, stack: Stack) -> LeftOut:
+    """The pixels of a stack that don't count; a line says how many."""
+    mask = None if section.mask is None else read_stack(section.mask).data != 0
+    stuck = None
+    if section.stuck is not None:
+        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:])
+        stuck = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask))
+    found = left_out(stack, mask, stuck)
+    if str(found):
+        print(found)
+    return found
+
+
+def load_support(config: Config, measured: Measured) -> Tensor | None:
+    """The voxels (z, y, x) of the field in which Δn is sought, and a line that says how many; None is all.
+
+    Raises StackError where the file is none, and ConfigError where its shape isn't the volume's.
+    """
+    named, grid = config.reconstruction.support, config.volume.grid
+    if named is None:
+        return None
+    if named == "edges":
+        found = edges_support(measured.data, measured.focus, grid, config.microscope)
+    else:
+        mask = read_stack(named).data != 0
+        if mask.shape not in ((1, *grid.shape), (1, 1, *grid.shape[1:])):
+            shape = "×".join(map(str, mask.shape[1:] if len(mask) == 1 else mask.shape))
+            raise ConfigError(
+                f"reconstruction.support: {named} is a mask of {shape}, the volume has {'×'.join(map(str, grid.shape))}"
+            )
+        found = np.broadcast_to(mask[0], grid.shape).copy()
+    print(f"Δn is sought in {found.mean():.1%} of the voxels (support = {named})")
+    return torch.from_numpy(found)
+
+
+def _check_feasible(config: Config) -> None:
     """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
     camera = config.microscope.camera
     if camera is not None and camera.pixel_size is not None:
@@ -51,6 +94,8 @@ def _check_support(config: Config) -> None:
             f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
             "volume's voxels"
         )
+    if config.reconstruction.method == "opl" and config.reconstruction.support is not None:
+        raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
     section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
     if section.method in ("newton", "linear"):
         asks, instead = f"reconstruction.method: {section.method!r} needs", "use method 'adam' with start 'zero'"

@@ -19,22 +19,27 @@ def misfit_for(config: Config, measured: Measured) -> Callable[[Tensor], Misfit]
     """What makes the configuration's misfit from the prepared images.
 
     Without a gain in [data], the Gaussian misfit goes by one noise for each prism, and the Poisson misfit by the gain
-    that the stack shows. Raises ConfigError where that shows none.
+    that the stack shows. Pixels that don't count are masked. Raises ConfigError where the stack shows no gain.
     """
-    named, model = config.reconstruction.misfit, _noise_model(config, measured)
+    named, model, counted = config.reconstruction.misfit, _noise_model(config, measured), measured.left_out.counted
+
+    def mask(data: Tensor) -> Tensor | None:
+        # the sample by which a descent's memory is foreseen has other pixels, of which all count
+        return None if counted is None or counted.shape != data.shape else torch.from_numpy(counted)
+
     if named == "robust":
         known = known_levels(report.noise or None for report in measured.prisms)  # a noise of 0 standardises nothing
         noise = None if known is None else torch.tensor(known)
-        return lambda data: RobustMisfit(data, noise)
+        return lambda data: RobustMisfit(data, noise, mask(data))
     if named == "gaussian":
-        return lambda data: GaussianMisfit(data, model)
-    model = model or noise_of_level(measured.data)
+        return lambda data: GaussianMisfit(data, model, mask(data))
+    model = model or noise_of_level(measured.data, counted)
     if model is None:
         raise ConfigError(
             "reconstruction.misfit: 'poisson' needs data.gain, counts per photoelectron: the noise of this stack "
             "doesn't tell it; use 'gaussian'"
         )
-    return lambda data: PoissonMisfit(data, model)
+    return lambda data: PoissonMisfit(data, model, mask(data))
 
 
 def _noise_model(config: Config, measured: Measured) -> NoiseModel | None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
-from recon.run.data import load_data
+from recon.run.data import load_data, load_support
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, descend_recorded
 from recon.run.results import Result, ResultsError, write_results
@@ -59,7 +60,7 @@ def reconstruct(
     check_room_for_volume(config.volume.grid, device)
     made = misfit or misfit_for(config, measured)
     problem = _problem(config, data, made, measured)
-    identity = _identity(config, measured, problem.misfit)
+    identity = _identity(config, measured, problem)
     start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
     sections = None
     if config.reconstruction.method in DIRECT:
@@ -111,7 +112,13 @@ def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], m
     setup = Setup(medium, config.microscope, config.acquisition, margin=margin)
     fidelity = config.fidelity or config.tolerance
     assert fidelity is not None
-    return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit, measured.noise)
+    support = load_support(config, measured)
+    try:
+        return Problem.from_recipe(data, setup, fidelity, config.reconstruction, misfit, measured.noise, support)
+    except ValueError as error:
+        if support is None:
+            raise
+        raise ConfigError(f"reconstruction.support: {config.reconstruction.support}: {error}") from error
 
 
 def _margin(config: Config, measured: Measured) -> int:
@@ -128,17 +135,27 @@ def _margin(config: Config, measured: Measured) -> int:
     return margin
 
 
-def _identity(config: Config, measured: Measured, misfit: Misfit) -> str:
+def _identity(config: Config, measured: Measured, problem: Problem) -> str:
     """All that the descent depends on, one line `key = value` each. Where a value differs, it is another descent."""
     fit = replace(
         config,
         data=None,  # what the descent sees of them is in their digest
         specimen=None,
         simulation=SimulationSection(),
-        reconstruction=replace(config.reconstruction, checkpoint_every=1),
+        reconstruction=replace(config.reconstruction, checkpoint_every=1, support=None),
     )
-    digest = hashlib.sha256(measured.data.tobytes()).hexdigest()
-    return "\n".join([*flat(fit), f"misfit = {misfit.name}", f"data's sha256 = {digest}"])
+    support = problem.support
+    digests = {
+        "data": measured.data,
+        "mask": measured.left_out.counted,
+        "support": None if support is None else support.cpu().numpy(),
+    }
+    seen = [f"{name}'s sha256 = {_digest(array)}" for name, array in digests.items() if array is not None]
+    return "\n".join([*flat(fit), f"misfit = {problem.misfit.name}", *seen])
+
+
+def _digest(array: np.ndarray) -> str:
+    return hashlib.sha256(array.tobytes()).hexdigest()
 
 
 def _checkpoint_to_resume(saved: Path, identity: str, *, resume: bool, restart: bool) -> Checkpoint | None:

@@ -18,8 +18,7 @@ from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, with_values
-from recon.recording.background import known_levels
-from recon.recording.preparation import Measured, PrismReport
+from recon.recording.preparation import Measured
 from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
@@ -60,32 +59,36 @@ def metrics(
     problem: Problem,
     last: Step,
     images: Float[Tensor, "prism focus y x"],
-    reports: tuple[PrismReport, ...],
+    measured: Measured,
     method: str,
 ) -> dict[str, Any]:
     """The numbers of metrics.json.
 
-    images: the model's, of the last step. reports: what the preparation found in each prism's measured images, such as
-    the standard deviation of their noise. method: that found the step.
+    images: the model's, of the last step. measured: what the preparation found in the stack, such as the standard
+    deviation of each prism's noise. method: that found the step.
     """
+    out = measured.left_out
     delta = problem.setup.within_field(last.delta)
     found: dict[str, Any] = {
         "method": method,
         "propagation": problem.fidelity.last(last.plans).propagation,
         "misfit": float(problem.misfit(images)),
-        "noise_misfit": problem.misfit.of_noise(known_levels(report.noise for report in reports)),
-        "residual_rms": residual_rms(images, problem.misfit.data),
+        "noise_misfit": problem.misfit.of_noise(measured.noise),
+        "residual_rms": residual_rms(images, problem.misfit.data, problem.misfit.mask),
         "steps": last.number,
         "seconds": round(last.seconds, 3),
         "delta": {"min": float(delta.min()), "max": float(delta.max()), "mean": float(delta.mean())},
         "learned": {name: value.tolist() for name, value in last.values.items() if name != IndexDifference.name},
-        "prisms": [asdict(report) for report in reports],
+        "prisms": [asdict(report) for report in measured.prisms],
+        "left_out": {"stuck": out.stuck, "saturated": out.saturated, "masked": out.masked, "share": out.share},
     }
     if last.weights:
         found["tv"] = last.weights[-1]["tv"]
         found["weights"] = [{k: _known(v) for k, v in record.items()} for record in last.weights]
     if problem.setup.margin > 0:
         found["margin"] = problem.setup.margin
+    if problem.support is not None:
+        found["support"] = {"share": float(problem.support.float().mean())}
     if last.plans:
         found["plans"] = list(last.plans)
     return found
@@ -126,9 +129,10 @@ def write_results(
     last, grid = ended.step, problem.setup.field
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
-    found = metrics(problem, last, images, measured.prisms, config.reconstruction.method)
+    found = metrics(problem, last, images, measured, config.reconstruction.method)
     warn_of_poor_fit(found["misfit"])
-    comments = "".join(f"# {announce_record(record)}\n" for record in last.plans)
+    notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
+    comments = "".join(f"# {note}\n" for note in notes)
     prisms = config.acquisition.prisms
 
     def write_sections() -> None:

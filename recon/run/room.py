@@ -7,12 +7,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from recon.fit.bounds import SupportedBounds
 from recon.fit.descent import minimise
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.newton.secants import MEMORY
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import empty_medium
+from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
 from recon.prior.weight import FollowsNoise
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
@@ -86,7 +88,7 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     # with a light prior every step of Newton's moves, and is remembered
     weight = FollowsNoise(0.0, data.numel(), first=LIGHT) if problem.method == "newton" else problem.weight
     sample = replace(problem, setup=setup, misfit=misfit(data), weight=weight, fidelity=given)
-    sample = replace(sample, steps=STEPS[problem.method])
+    sample = replace(sample, steps=STEPS[problem.method], unknowns=[_of_shape(u, few.shape) for u in sample.unknowns])
 
     def descend() -> None:
         last = None
@@ -101,6 +103,13 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
 
     beside = most(course_of(descend)) - most(course_of(compute_image))
     return math.ceil(beside * math.prod(grid.shape[1:]) / math.prod(few.shape[1:]))
+
+
+def _of_shape(unknown: Unknown, shape: tuple[int, int, int]) -> Unknown:
+    """An unknown with a support, if it has one, of another shape."""
+    if not isinstance(unknown, IndexDifference) or not isinstance(unknown.bounds, SupportedBounds):
+        return unknown
+    return replace(unknown, bounds=replace(unknown.bounds, support=torch.ones(shape, dtype=torch.bool)))
 
 
 def _of_one_source(microscope: Microscope) -> Microscope:
