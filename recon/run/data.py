@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import torch
 
-from recon.config.schema import Config, ConfigError
+from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
 from recon.misfit.base import spatial_variance
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, prepare
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
+from torchdic.files.format import Stack
 from torchdic.files.stack import read_stack
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
@@ -24,9 +25,16 @@ def load_data(config: Config) -> Measured:
     """
     if config.data is None:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
-    _check_support(config)
-    section = config.data
-    stack = read_stack(section.path)
+    check_support(config)
+    return prepared(config, read_stack(config.data.path))
+
+
+def prepared(config: Config, stack: Stack) -> Measured:
+    """A stack of a configuration's acquisition, relative to the empty bright field, as its [data] says how.
+
+    Raises StackError where it is no stack of this acquisition or shows nothing.
+    """
+    section = config.data or DataSection(stack.source)
     expected = ExpectedStack(
         biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
         focus=tuple(float(focus) for focus in config.acquisition.focus),
@@ -39,18 +47,23 @@ def load_data(config: Config) -> Measured:
     try:
         spatial_variance(torch.from_numpy(measured.data))
     except ValueError as error:
-        raise StackError(f"{section.path}: {error}") from error
+        raise StackError(f"{stack.source}: {error}") from error
     return measured
 
 
-def _check_support(config: Config) -> None:
-    """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
+def check_pixels(config: Config) -> None:
+    """Raise ConfigError where the camera's pixels aren't the volume's voxels."""
     camera = config.microscope.camera
     if camera is not None and camera.pixel_size is not None:
         raise ConfigError(
             f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
             "volume's voxels"
         )
+
+
+def check_support(config: Config) -> None:
+    """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
+    check_pixels(config)
     section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
     if section.method in ("newton", "linear"):
         asks, instead = f"reconstruction.method: {section.method!r} needs", "use method 'adam' with start 'zero'"
