@@ -370,8 +370,8 @@ def compare(options: argparse.Namespace, tomogram: Tomogram) -> None:
     true = more.truth - scene.truth
     print(f"\n{POINT_HEAD}\n" + point_row("truth", true, twice.truth - scene.truth, true), flush=True)
     for name in ("newton", "linear"):
-        changes = (METHODS[name](changed) - volumes[name] for changed in (more, twice))
-        print(point_row(name, *changes, true), flush=True)
+        single, pairs = (METHODS[name](changed) - volumes[name] for changed in (more, twice))
+        print(point_row(name, single, pairs, true), flush=True)
 
 
 def main() -> int:
