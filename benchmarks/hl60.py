@@ -8,9 +8,9 @@ reconstruction of the ODTbrain examples (CC0). What the tomogram shows is taken 
 
 The stack: two shear axes × bias ±90°, 15 planes of ±7 µm, from voxels of half the reconstruction's sides, with 112
 directions, pixels that integrate, and Poisson noise. "error" is the relative L2 error of Δn, over the volume and by
-region; "correlation" that of Δn with the true one over the cell; "mass" the sum of Δn over the true one. "cell, z" is
-how deep the columns through the cell's middle are above half of its cytoplasm; the nucleolus's extents are the widths
-of the profile through its centre at half of its height over the cytoplasm; µm.
+region; "correlation" that of Δn with the true one, over the volume and in the cell; "mass" the sum of Δn over the true
+one. "cell, z" is how deep the columns through the cell's middle are above half of its cytoplasm; the nucleolus's extents
+are the widths of the profile through its centre at half of its height over the cytoplasm; µm.
 
 Resolution, in two ways. (1) Fourier correlation: of the coefficients of Δn with the true ones in shells of frequency,
 within 30° of the axis z and within 30° of the plane across it. The resolution is the period at which it first falls
@@ -240,12 +240,13 @@ def row(name: str, delta: Tensor, truth: Tensor, parts: dict[str, Tensor], secon
     """A volume's line of the table."""
     cell = parts["cell"]
     means = {part: float(delta[parts[part]].mean()) for part in ("cytoplasm", "nucleus", "nucleolus")}
-    correlation = float(torch.corrcoef(torch.stack([delta[cell], truth[cell]]))[0, 1])
-    regions = [f"{mean:.4f} ({volume_error(delta[parts[p]], truth[parts[p]]):.2f})" for p, mean in means.items()]
+    everywhere = torch.ones_like(cell)
+    correlations = [float(torch.corrcoef(torch.stack([delta[p], truth[p]]))[0, 1]) for p in (everywhere, cell)]
+    regions = [f"{mean:.4f} ({volume_error(delta * parts[p], truth * parts[p]):.2f})" for p, mean in means.items()]
     cells = (
         name,
         f"{volume_error(delta, truth):.3f}",
-        f"{correlation:.3f}",
+        *(f"{correlation:.3f}" for correlation in correlations),
         f"{float(delta.sum() / truth.sum()):.2f}",
         *regions,
         f"{cell_extent(delta, cell, means['cytoplasm']):.1f}",
@@ -258,8 +259,8 @@ def row(name: str, delta: Tensor, truth: Tensor, parts: dict[str, Tensor], secon
 
 
 HEAD = (
-    "| | error | correlation | mass | cytoplasm | nucleus | nucleolus | cell, z | nucleolus, z | nucleolus, x "
-    "| resolution, z | across | s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| | error | correlation | in the cell | mass | cytoplasm | nucleus | nucleolus "
+    "| cell, z | nucleolus, z | nucleolus, x | resolution, z | across | s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 

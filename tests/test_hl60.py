@@ -160,5 +160,5 @@ def test_the_measured_cell_is_found_best_by_the_default(hl60, measured_file, mon
     assert newton < 0.25 < 0.8 * linear
     assert linear < opl
     # the default's resolution along z is worse than across it
-    assert float(found["newton"][9]) > 1.5 * float(found["newton"][10])
+    assert float(found["newton"][10]) > 1.5 * float(found["newton"][11])
     assert (tmp_path / "hl60.png").stat().st_size > 10000
