@@ -9,8 +9,8 @@ reconstruction of the ODTbrain examples (CC0). What the tomogram shows is taken 
 The stack: two shear axes × bias ±90°, 15 planes of ±7 µm, from voxels of half the reconstruction's sides, with 112
 directions, pixels that integrate, and Poisson noise. "error" is the relative L2 error of Δn, over the volume and by
 region; "correlation" that of Δn with the true one, over the volume and in the cell; "mass" the sum of Δn over the true
-one. "cell, z" is how deep the columns through the cell's middle are above half of its cytoplasm; the nucleolus's extents
-are the widths of the profile through its centre at half of its height over the cytoplasm; µm.
+one. "cell, z" is how deep the columns through the cell's middle are above half of its cytoplasm; the nucleolus's
+extents are the widths of the profile through its centre at half of its height over the cytoplasm; µm.
 
 Resolution, in two ways. (1) Fourier correlation: of the coefficients of Δn with the true ones in shells of frequency,
 within 30° of the axis z and within 30° of the plane across it. The resolution is the period at which it first falls
@@ -260,7 +260,7 @@ def row(name: str, delta: Tensor, truth: Tensor, parts: dict[str, Tensor], secon
 
 HEAD = (
     "| | error | correlation | in the cell | mass | cytoplasm | nucleus | nucleolus "
-    "| cell, z | nucleolus, z | nucleolus, x | resolution, z | across | s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| cell, z | nucleolus, z | nucleolus, x | resolution, z | across | s |\n" + "|---" * 14 + "|"
 )
 
 
