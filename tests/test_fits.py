@@ -127,7 +127,7 @@ def test_steps_count_for_their_own_method_and_fidelity_for_its_own_propagation(c
     assert (adam.reconstruction.steps, newton.reconstruction.steps) == (7, None)
     assert {c.reconstruction.tv for c in (adam, newton, straight)} == {(3.0, 1.0)}
     assert adam.fidelity == Fidelity("rays", steps=3, sources=8)
-    assert straight.fidelity == Fidelity("projection", sources=8)
+    assert straight.fidelity == Fidelity("projection", 3, 8)
     assert list(map(float, adam.acquisition.focus)) == [-1.0, 0.0, 1.0]
 
 

@@ -85,4 +85,5 @@ def _usual(config: Config, method: str, propagation: str) -> Fidelity:
         return config.fidelity
     if propagation == TRUTH:
         return RECOMMENDED_FOR_ADAM if method == "adam" else RECOMMENDED
-    return Fidelity(propagation, sources=FEW_DIRECTIONS.get(propagation, RECOMMENDED_FOR_ADAM.sources))
+    sources = FEW_DIRECTIONS.get(propagation, RECOMMENDED_FOR_ADAM.sources)
+    return Fidelity(propagation, max(1, config.volume.shape[0] // 2), sources)  # bent rays take a step for two slices
