@@ -237,6 +237,13 @@ def test_without_a_truth_the_misfit_is_all_that_is_told(recorded):
     assert trial.over_noise > 0
 
 
+def test_a_clean_stacks_misfit_is_over_nothing(recorded):
+    (trial,) = fit_trials(replace(recorded, noisy=False), [FitCandidate("opl", None, None, 5)])
+    assert trial.noise_misfit == trial.whole_noise_misfit == 0
+    assert trial.over_noise is trial.whole_over_noise is None
+    assert trial.misfit > 0
+
+
 def test_more_directions_hold_more_bytes(recorded):
     few = shortened(recorded, method="adam", steps=1, start="zero")
     trials = list(fit_trials(few, [FitCandidate("adam", "wave", n, 2) for n in (4, 64)]))

@@ -82,11 +82,12 @@ def _recorded(config: Config, source: str, device: torch.device) -> Recorded:
     exact = hasattr(specimen, "field")
     print(f"the specimen's stack, from {'its exact field' if exact else 'a finer model'} …", flush=True)
     images = model.images(specimen, grid, config.microscope, config.acquisition)
-    if config.microscope.camera is not None:
-        generator = torch.Generator().manual_seed(config.simulation.seed)
-        images = config.microscope.camera.record(images, generator)
+    camera = config.microscope.camera
+    if camera is not None:
+        images = camera.record(images, torch.Generator().manual_seed(config.simulation.seed))
     stack = Stack(images.numpy(), grid.spacing[1:], source=source)
-    return Recorded(config, prepared(config, stack), model.truth(specimen, grid), device)
+    noisy = camera is not None and camera.photons is not None
+    return Recorded(config, prepared(config, stack), model.truth(specimen, grid), device, noisy)
 
 
 def _interrupt(_number: int, _frame: object) -> NoReturn:

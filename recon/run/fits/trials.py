@@ -44,13 +44,15 @@ class Recorded:
     """A stack that is to be fitted.
 
     config: of the stack. measured: its images, relative to the empty bright field. truth: Δn (z, y, x) on the
-    configuration's grid; None where it isn't known. device: where to compute.
+    configuration's grid; None where it isn't known. device: where to compute. noisy: whether there is noise; what is
+    measured in clean images is their rounding.
     """
 
     config: Config
     measured: Measured
     truth: Float[Tensor, "z y x"] | None
     device: torch.device
+    noisy: bool = True
 
     def planes(self, indices: Sequence[int]) -> Measured:
         """The stack of some of its planes."""
@@ -101,7 +103,7 @@ class _Fit:
             None if truth is None else volume_error(delta, truth),
             None if truth is None else float(delta.sum() / truth.sum()),
             own,
-            problem.misfit.of_noise(levels),
+            problem.misfit.of_noise(levels) if self.recorded.noisy else 0.0,
             whole,
             whole_noise,
             step.number,
@@ -141,7 +143,8 @@ class _Fit:
         except CANNOT_CROSS:
             return None, None
         lit = images * best_brightness(images, misfit)[..., None, None]
-        return float(misfit(lit)), misfit.of_noise(known_levels(report.noise for report in everything.prisms))
+        levels = known_levels(report.noise for report in everything.prisms)
+        return float(misfit(lit)), misfit.of_noise(levels) if self.recorded.noisy else 0.0
 
     def whole_misfit(self) -> Misfit:
         """The configuration's misfit of the whole stack."""
