@@ -3,6 +3,7 @@ method.
 
     python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
     python benchmarks/reconstruction.py ablation [NAME ...] [--cache DIR]
+    python benchmarks/reconstruction.py acquisitions [cell bead] [--cache DIR]
     python benchmarks/reconstruction.py nuisances | propagations | methods | stuck | support [--cache DIR]
 
 "error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
@@ -44,7 +45,7 @@ from recon.recording.support import edges_support
 from recon.report.metrics import volume_error
 from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
 from scenes import Scene
-from torchdic import Acquisition, Fidelity, Prism
+from torchdic import Acquisition, Camera, Fidelity, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
 
@@ -292,9 +293,57 @@ def _opl(scene: Scene) -> str:
     return f"{volume_error(found.delta, scene.truth):.3f} ({time.process_time() - began:.1f} s)"
 
 
+# What an acquisition may hold: which prisms of two shear axes × bias ±90°.
+PRISMS = {
+    "two axes, ±90°": (0, 1, 2, 3),
+    "two axes, 90°": (0, 2),
+    "one axis, ±90°": (0, 1),
+    "one axis, 90°": (0,),
+}
+# Planes that are evenly spaced from −4 to 4 µm; one is the middle. All are among the 17.
+PLANES = (1, 3, 5, 9, 17)
+PHOTONS = (300.0, 1000.0, 4000.0, 40000.0)
+USUAL_PLANES, USUAL_PHOTONS = 9, 4000.0
+
+
+def acquisitions(options: argparse.Namespace) -> None:
+    """Errors of the default recipe by planes, shear axes, biases and photons: of the cell and the bead, or those named.
+
+    All stacks of a scene are parts of one noiseless stack of 17 planes, each with noise of its own.
+    """
+    for name in options.names or ("cell", "bead"):
+        most = scenes.acquisition(scenes.SHEARS, (math.pi / 2, -math.pi / 2), [i / 2 for i in range(-8, 9)])
+        full = replace(scenes.SETUPS[name](), acquisition=most, photons=None).scene(name, options.cache)
+        columns = [*PRISMS, "two axes, ±90°, the light of 9 planes"]
+        print(f"\n{name}, {USUAL_PHOTONS:g} photons\n\n| planes | " + " | ".join(columns) + " |")
+        print("|---" * (1 + len(columns)) + "|")
+        for planes in PLANES:
+            found = [fit(part(full, prisms, planes, USUAL_PHOTONS)) for prisms in PRISMS.values()]
+            shared = USUAL_PHOTONS * USUAL_PLANES / planes
+            found.append(fit(part(full, PRISMS["two axes, ±90°"], planes, shared)))
+            print(f"| {planes} | " + " | ".join(f"{f.error:.3f} ({f.mass:.2f})" for f in found) + " |", flush=True)
+        some = {which: PRISMS[which] for which in ("two axes, ±90°", "one axis, 90°")}
+        print(f"\n{name}, {USUAL_PLANES} planes\n\n| photons | " + " | ".join(some) + " |")
+        print("|---" * (1 + len(some)) + "|")
+        for photons in PHOTONS:
+            found = [fit(part(full, prisms, USUAL_PLANES, photons)) for prisms in some.values()]
+            print(f"| {photons:g} | " + " | ".join(f"{f.error:.3f} ({f.mass:.2f})" for f in found) + " |", flush=True)
+
+
+def part(full: Scene, prisms: Sequence[int], planes: int, photons: float) -> Scene:
+    """Some prisms and evenly spaced planes of a noiseless scene, with noise."""
+    acquired, number = full.acquisition, len(full.acquisition.focus)
+    chosen = [number // 2] if planes == 1 else [i * (number - 1) // (planes - 1) for i in range(planes)]
+    images = Camera(photons=photons).record(full.data[list(prisms)][:, chosen], torch.Generator().manual_seed(0))
+    focus = [acquired.focus[i] for i in chosen]
+    acquisition = Acquisition([acquired.prisms[p] for p in prisms], focus)
+    return replace(full, data=images, acquisition=acquisition, photons=photons)
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "scenes": all_scenes,
     "ablation": ablation,
+    "acquisitions": acquisitions,
     "nuisances": nuisances,
     "propagations": propagations,
     "methods": methods,

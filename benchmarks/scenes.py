@@ -31,20 +31,17 @@ from data_synthetic import Bead, CellPhantom, Ellipsoid, GaussianBall, Organelle
 from recon.cli import demo
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
-from recon.run.exact_images import ExactSpecimen, exact_images
+from recon.run.fits.finer import FinerModel
 from specimens import Fibre, GradedEllipsoid, Together, any_specimen, solid, stronger
 from torchdic import (
     Acquisition,
     Camera,
     Condenser,
-    Fidelity,
     Grid,
     Microscope,
     Objective,
     Prism,
-    Volume,
     __version__,
-    image,
 )
 from torchdic.files.whole import written_whole
 
@@ -137,31 +134,22 @@ class Setup:
         return hashlib.sha256(repr((__version__, *parts)).encode()).hexdigest()[:16]
 
     @property
+    def model(self) -> FinerModel:
+        """The model that makes the images of a specimen without an exact field."""
+        return FinerModel(self.finer, self.margin, self.sources)
+
+    @property
     def fine_grid(self) -> Grid:
         """The grid of the model that makes the images, without its margin."""
-        shape, spacing = self.grid.shape, self.grid.spacing
-        (kz, ky, kx) = self.finer
-        return Grid((kz * shape[0], ky * shape[1], kx * shape[2]), (spacing[0] / kz, spacing[1] / ky, spacing[2] / kx))
+        return self.model.grid(self.grid)
 
     def truth(self) -> Float[Tensor, "z y x"]:
         """Δn on the reconstruction's grid: the mean of the finer voxels in each."""
-        (kz, ky, kx), (nz, ny, nx) = self.finer, self.grid.shape
-        return self.specimen.delta(self.fine_grid).reshape(nz, kz, ny, ky, nx, kx).mean((1, 3, 5)).float()
+        return self.model.truth(self.specimen, self.grid)
 
-    @torch.no_grad()
     def images(self) -> Float[Tensor, "prism focus y x"]:
         """The noiseless images on the recorded pixels, float32."""
-        (_, ky, kx), (_, ny, nx) = self.finer, self.grid.shape
-        fidelity = Fidelity("wave", sources=self.sources, order=2)
-        if isinstance(self.specimen, ExactSpecimen):
-            fine = exact_images(self.specimen, self.fine_grid, self.microscope, self.acquisition, fidelity)
-        else:
-            rows, columns = self.margin * ky, self.margin * kx
-            wide = self.fine_grid.widened(rows, columns)
-            volume = Volume(wide, self.specimen.delta(wide, dtype=torch.float32), self.specimen.background)
-            fine = image(volume, self.microscope, self.acquisition, fidelity)
-            fine = fine[..., rows : rows + ky * ny, columns : columns + kx * nx]
-        return fine.unflatten(3, (nx, kx)).unflatten(2, (ny, ky)).mean((3, 5)).float()
+        return self.model.images(self.specimen, self.grid, self.microscope, self.acquisition)
 
     def scene(self, name: str, cache: Path | None = None) -> Scene:
         """The scene itself. cache: a folder in which its noiseless images are found or left; None keeps nothing."""

@@ -47,6 +47,15 @@ def earlier_run(parser: argparse.ArgumentParser) -> None:
     choice.add_argument("--restart", action="store_true", help="start again and discard an interrupted run in DIR")
 
 
+def fit(parser: argparse.ArgumentParser) -> None:
+    """Whether reconstructions are measured instead of images."""
+    parser.add_argument(
+        "--fit",
+        action="store_true",
+        help="measure reconstructions instead of images: error of the volume, or misfit over noise of a measured stack",
+    )
+
+
 def version(parser: argparse.ArgumentParser) -> None:
     """The version of torchdic."""
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}", help="print the version")

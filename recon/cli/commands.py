@@ -53,9 +53,9 @@ COMMANDS = {
         (arguments.config, arguments.out, arguments.device, arguments.earlier_run),
     ),
     "work-precision": Command(
-        "measure what accuracy costs: the error of images against seconds and memory",
+        "measure what accuracy costs: the error of images, or of reconstructions, against seconds and memory",
         work_precision.run,
-        (arguments.config, arguments.out, arguments.device),
+        (arguments.config, arguments.out, arguments.device, arguments.fit, arguments.earlier_run),
     ),
 }
 

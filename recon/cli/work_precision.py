@@ -7,9 +7,10 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from recon.cli import fits
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
-from recon.config.schema import Config
+from recon.config.schema import Config, ConfigError
 from recon.report import figures
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.run.exact_images import exact_images
@@ -23,6 +24,12 @@ from torchdic.planning.work_precision import converged_fidelities, ladder, trial
 
 def run(options: argparse.Namespace) -> None:
     """Time each candidate, compare it with the truth, and leave the measurements as CSV, JSON and a figure."""
+    if options.fit:
+        fits.run(options)
+        return
+    for name in ("resume", "restart"):
+        if getattr(options, name):
+            raise ConfigError(f"--{name} goes with --fit: images are measured anew each time")
     config = load(options.config)
     specimen = specimen_of(config, str(options.config))
     check_exact_field(config, specimen, str(options.config))

@@ -16,7 +16,14 @@ from cattrs.errors import IterableValidationError, IterableValidationNote
 from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
-from recon.config.schema import CompensatorSection, Config, DataSection, ReconstructionSection, WedgeSection
+from recon.config.schema import (
+    CompensatorSection,
+    Config,
+    DataSection,
+    ReconstructionSection,
+    WedgeSection,
+    WorkPrecisionSection,
+)
 from torchdic import Acquisition, Candidate, Condenser, JonesPupil, Layer, Objective, Polarisation, Prism, Spectrum
 
 # The name by which a list of prisms holds bright field, which has none.
@@ -239,6 +246,10 @@ FIELDS: dict[type, dict[str, Hook]] = {
         "learn": _array_of(_string),
         "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
         "margin": _or("auto", _whole_number),
+    },
+    WorkPrecisionSection: {
+        **dict.fromkeys(("methods", "propagations"), _array_of(_string)),
+        **dict.fromkeys(("directions", "planes"), _array_of(_whole_number)),
     },
     Config: {"candidates": _array_of(_candidate)},
 }

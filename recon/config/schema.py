@@ -5,8 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from recon.fit.problem import Recipe
+from recon.fit.problem import DIRECT, STEPS, Recipe
 from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope, Prism
+from torchdic.fidelity import PROPAGATIONS
 from torchdic.instrument.microscope import check_apertures
 
 
@@ -173,15 +174,35 @@ class WorkPrecisionSection:
 
     repeats: how often each candidate is timed.
     reference: the fidelity whose result counts as converged; None takes one that is finer than every candidate.
-    Raises ValueError for repeats below 1.
+    methods, propagations, directions, planes: what fits are made of (`--fit`), each combination that makes sense; see
+        `recon.run.fits.ladder`. directions are numbers of condenser directions, planes of focus planes. None takes all
+        methods and propagations, each with its recommended directions (Newton's also with those of its drafts alone),
+        and all planes, every second, every fourth.
+    Raises ValueError for repeats below 1, an empty list, a method or a propagation that there isn't, and a number of
+    directions or planes below 1.
     """
 
     repeats: int = 3
     reference: Fidelity | None = None
+    methods: tuple[str, ...] | None = None
+    propagations: tuple[str, ...] | None = None
+    directions: tuple[int, ...] | None = None
+    planes: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.repeats < 1:
             raise ValueError(f"repeats {self.repeats} must be at least 1")
+        for name in ("methods", "propagations", "directions", "planes"):
+            if getattr(self, name) == ():
+                raise ValueError(f"{name} must hold at least one; leave it out for the default ones")
+        for name, known in (("methods", (*STEPS, *DIRECT)), ("propagations", tuple(PROPAGATIONS))):
+            for value in getattr(self, name) or ():
+                if value not in known:
+                    raise ValueError(f"{name} {value!r} must be among {', '.join(map(repr, known))}")
+        for name in ("directions", "planes"):
+            for value in getattr(self, name) or ():
+                if value < 1:
+                    raise ValueError(f"{name} {value} must be at least 1")
 
 
 @dataclass(frozen=True, eq=False)

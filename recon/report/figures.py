@@ -80,15 +80,19 @@ def draw_images(
 
 
 def draw_sections(
-    volumes: Mapping[str, Float[Tensor, "z y x"]], grid: Grid, planes: Sequence[str] = ("xy", "xz", "yz")
+    volumes: Mapping[str, Float[Tensor, "z y x"]],
+    grid: Grid,
+    planes: Sequence[str] = ("xy", "xz", "yz"),
+    through: tuple[int, int, int] | None = None,
 ) -> Figure:
     """Draw sections through volumes on one scale: a column for each volume, a row for each plane.
 
-    volumes: Δn (z, y, x) by title. All sections go through the centre of |Δn| of the first volume.
+    volumes: Δn (z, y, x) by title.
     grid: of all volumes.
     planes: of "xy", "xz" and "yz", the horizontal axis first.
+    through: the voxel (z, y, x) in all sections; None is the centre of |Δn| of the first volume.
     """
-    through = _centre(next(iter(volumes.values())))
+    through = through or _centre(next(iter(volumes.values())))
     top = max(float(v.max()) for v in volumes.values())
     bottom = min(0.0, *(float(v.min()) for v in volumes.values()))
     size = dict(zip("zyx", grid.extent, strict=True))

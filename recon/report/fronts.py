@@ -30,6 +30,15 @@ class Mark(NamedTuple):
     marker: str
 
 
+class Point(NamedTuple):
+    """A cost and an error, both above 0, with their name and how they look."""
+
+    cost: float
+    error: float
+    name: str
+    mark: Mark
+
+
 # The marks of the docs' figures.
 MARKS = {"projection": Mark("tab:blue", "s"), "rays": Mark("tab:orange", "^"), "wave": Mark("tab:green", "o")}
 
@@ -128,7 +137,7 @@ def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str]
     figure.draw_without_rendering()  # lays the axes out
     figure.set_layout_engine("none")
     for axes in grid.flat:
-        _keep_labels_apart(axes)
+        keep_labels_apart(axes)
     return figure
 
 
@@ -153,23 +162,33 @@ def _draw_row(axes: Sequence[Axes], scene: str, trials: Sequence[Trial], quantit
 
 def _draw_panel(ax: Axes, trials: Sequence[Trial], cost: str, error: str, marks: dict[str, Mark]) -> None:
     """Draw one error of the trials against one cost, both named by the fields of Trial."""
-    known = [trial for trial in trials if getattr(trial, cost) is not None and getattr(trial, error) is not None]
-    costs = [getattr(trial, cost) for trial in known]
-    errors = [max(LEAST_ERROR, getattr(trial, error)) for trial in known]
-    front = pareto_front(costs, errors)
-    ax.plot([costs[i] for i in front], [errors[i] for i in front], color="0.6", linewidth=1, zorder=1)
-    for i, trial in enumerate(known):
+    points = []
+    for trial in trials:
+        x, y = getattr(trial, cost), getattr(trial, error)
+        if x is None or y is None:
+            continue
         mark = marks[trial.candidate.fidelity.propagation]
+        if trial.candidate.dtype == "float64":
+            mark = mark._replace(marker="x")
+        points.append(Point(x, max(LEAST_ERROR, y), trial.name, mark))
+    draw_points(ax, points)
+
+
+def draw_points(ax: Axes, points: Sequence[Point]) -> None:
+    """Draw errors against costs, both logarithmic: those on the Pareto front with their names, the others pale."""
+    front = pareto_front([p.cost for p in points], [p.error for p in points])
+    ax.plot([points[i].cost for i in front], [points[i].error for i in front], color="0.6", linewidth=1, zorder=1)
+    for i, point in enumerate(points):
         ax.plot(
-            costs[i],
-            errors[i],
-            "x" if trial.candidate.dtype == "float64" else mark.marker,
-            color=mark.colour,
+            point.cost,
+            point.error,
+            point.mark.marker,
+            color=point.mark.colour,
             markersize=6 if i in front else 4,
             alpha=1 if i in front else PALE,
         )
         if i in front:
-            _label(ax, trial.name, (costs[i], errors[i]))
+            _label(ax, point.name, (point.cost, point.error))
     _scale_logarithmically(ax)
 
 
@@ -207,7 +226,7 @@ def _legend_handles(ax: Axes, marks: dict[str, Mark]) -> list[Artist]:
     return handles
 
 
-def _keep_labels_apart(ax: Axes) -> None:
+def keep_labels_apart(ax: Axes) -> None:
     """Move each label to the first of LABEL_PLACES where it hides no other label, no point and no edge."""
     renderer = ax.figure.canvas.get_renderer()  # pyright: ignore[reportAttributeAccessIssue]
     frame = ax.get_window_extent(renderer)

@@ -30,9 +30,16 @@ def load_data(config: Config) -> Measured:
     """
     if config.data is None:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
-    _check_feasible(config)
-    section = config.data
-    stack = read_stack(section.path, section.series)
+    check_feasible(config)
+    return prepared(config, read_stack(config.data.path, config.data.series))
+
+
+def prepared(config: Config, stack: Stack) -> Measured:
+    """A stack of a configuration's acquisition, relative to the empty bright field, as its [data] says how.
+
+    Raises StackError where it is no stack of this acquisition or shows nothing.
+    """
+    section = config.data or DataSection(stack.source)
     expected = ExpectedStack(
         biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
         focus=tuple(float(focus) for focus in config.acquisition.focus),
@@ -47,7 +54,7 @@ def load_data(config: Config) -> Measured:
     try:
         spatial_variance(torch.from_numpy(measured.data), None if counted is None else torch.from_numpy(counted))
     except ValueError as error:
-        raise StackError(f"{section.path}: {error}") from error
+        raise StackError(f"{stack.source}: {error}") from error
     return measured
 
 
@@ -86,14 +93,19 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     return torch.from_numpy(found)
 
 
-def _check_feasible(config: Config) -> None:
-    """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
+def check_pixels(config: Config) -> None:
+    """Raise ConfigError where the camera's pixels aren't the volume's voxels."""
     camera = config.microscope.camera
     if camera is not None and camera.pixel_size is not None:
         raise ConfigError(
             f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
             "volume's voxels"
         )
+
+
+def check_feasible(config: Config) -> None:
+    """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
+    check_pixels(config)
     if config.reconstruction.method == "opl" and config.reconstruction.support is not None:
         raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
     section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]

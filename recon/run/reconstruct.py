@@ -54,12 +54,12 @@ def reconstruct(
     the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint and the volume so far saved;
     ResultsError where results cannot be written.
     """
-    config = _spelled_out(config)
+    config = spelled_out(config)
     measured = load_data(config)
     data = torch.from_numpy(measured.data).to(device)
     check_room_for_volume(config.volume.grid, device)
     made = misfit or misfit_for(config, measured)
-    problem = _problem(config, data, made, measured)
+    problem = problem_of(config, data, made, measured)
     identity = _identity(config, measured, problem)
     start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
     sections = None
@@ -94,7 +94,7 @@ def prepare_folder(out: Path) -> None:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
 
 
-def _spelled_out(config: Config) -> Config:
+def spelled_out(config: Config) -> Config:
     """The configuration with what it leaves to the method: the fidelity, and how a descent steps."""
     section = config.reconstruction
     if config.tolerance is None and config.fidelity is None:
@@ -105,9 +105,9 @@ def _spelled_out(config: Config) -> Config:
     return replace(config, reconstruction=steps)
 
 
-def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], measured: Measured) -> Problem:
+def problem_of(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], measured: Measured) -> Problem:
     """What the configuration asks to be fitted to the data, with the fidelity or for the tolerance that it gives."""
-    margin = _margin(config, measured)
+    margin = margin_of(config, measured)
     medium = empty_medium(config.volume.grid.widened(margin, margin), config.volume.background, data)
     setup = Setup(medium, config.microscope, config.acquisition, margin=margin)
     fidelity = config.fidelity or config.tolerance
@@ -121,7 +121,7 @@ def _problem(config: Config, data: Tensor, misfit: Callable[[Tensor], Misfit], m
         raise ConfigError(f"reconstruction.support: {config.reconstruction.support}: {error}") from error
 
 
-def _margin(config: Config, measured: Measured) -> int:
+def margin_of(config: Config, measured: Measured) -> int:
     """Voxels beyond the field on each side; a line says so where they are added without having been asked for."""
     section = config.reconstruction
     if section.margin != "auto":
