@@ -149,7 +149,11 @@ def test_thin_object_images_there_as_here():
     torch.testing.assert_close(bring(there), here)
 
 
-@pytest.mark.parametrize("recipe", [Recipe(steps=5), Recipe("adam", 2)], ids=["newton", "adam"])
+@pytest.mark.parametrize(
+    "recipe",
+    [Recipe(steps=5), pytest.param(Recipe(steps=10), marks=pytest.mark.slow), Recipe("adam", 2)],
+    ids=["newton", "newton to its end", "adam"],
+)
 def test_descent_goes_there_as_here(values, recipe):
     data = images(values, SCOPES["plain"], FIDELITY).detach()
     settings = [Prism((0.07, -0.19), 0.8), None, Prism((0.1, 0.2), 0.3)]

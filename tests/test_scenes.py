@@ -149,12 +149,21 @@ def test_every_specimen_leaves_a_margin_unless_its_field_is_cut(truths):
         assert (float(rim.max()) > 0.01 * float(delta.max())) == (name == "yeast"), name
 
 
-def test_every_bound_admits_the_truth(scenes, truths):
-    drawn = [(setup, setup.truth()) for setup in map(scenes.drawn_setup, range(2))]
-    for setup, truth in [*truths.values(), *drawn]:
-        low, high = setup.bounds
-        assert low is None or float(truth.min()) >= low - 1e-8
-        assert high is None or float(truth.max()) <= high + 1e-8
+def assert_admitted(setup, truth):
+    low, high = setup.bounds
+    assert low is None or float(truth.min()) >= low - 1e-8
+    assert high is None or float(truth.max()) <= high + 1e-8
+
+
+def test_every_bound_admits_the_truth(truths):
+    for setup, truth in truths.values():
+        assert_admitted(setup, truth)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
+def test_bounds_of_drawn_scenes_admit_their_truth(scenes, seed):
+    setup = scenes.drawn_setup(seed)
+    assert_admitted(setup, setup.truth())
 
 
 def test_drawn_scenes_differ_and_repeat(scenes):
