@@ -8,7 +8,7 @@ from absolute import Absolute
 from recon.fit.bounds import SHARPNESS, Bounds
 from recon.misfit.base import spatial_variance
 from recon.misfit.gaussian import GaussianMisfit
-from recon.prior.edges import SMOOTHING, TotalVariation, total_variation
+from recon.prior.edges import CORNERS, SMOOTHING, TotalVariation, total_variation
 from recon.prior.magnitude import Magnitude, magnitude
 from recon.prior.schedule import cosine, held_then_annealed
 from torchdic import Grid, Volume
@@ -134,7 +134,7 @@ def test_each_prior_has_its_own_schedule():
 def test_total_variation_of_one_voxel_is_its_differences_to_the_next():
     delta = torch.zeros(3, 4, 5, dtype=torch.float64)
     delta[1, 2, 3] = 0.01
-    # the voxel itself differs from three next ones (√3), and three ones before it from it (1 each)
+    # at each corner the voxel itself has three differences (√3), and three neighbours have one each
     expected = 0.01 * (math.sqrt(3) + 3) / 60
     assert total_variation(delta, (0.2, 0.2, 0.2)).item() == pytest.approx(expected, abs=2 * SMOOTHING)
 
@@ -173,14 +173,17 @@ def test_total_variation_ignores_a_uniform_index():
 def test_total_variation_of_a_single_slice_is_that_of_the_other_axes(axis):
     thick = torch.rand(4, 5, 6, dtype=torch.float64)
     thin = thick.narrow(axis, 0, 1).clone().requires_grad_()
-    squares = SMOOTHING**2
-    for other, step in enumerate((0.4, 0.3, 0.2)):
-        if other != axis:
-            rise = thin.detach().diff(dim=other) * 0.2 / step
-            last = torch.zeros_like(thin.detach().narrow(other, 0, 1))
-            squares = squares + torch.cat([rise, last], other).square()
+    total = 0.0
+    for corner in CORNERS:
+        squares = SMOOTHING**2
+        for other, step in enumerate((0.4, 0.3, 0.2)):
+            if other != axis:
+                rise = thin.detach().diff(dim=other) * 0.2 / step
+                none = torch.zeros_like(thin.detach().narrow(other, 0, 1))
+                squares = squares + torch.cat([none, rise] if corner[other] else [rise, none], other).square()
+        total += squares.sqrt().mean().item() / len(CORNERS)
     value = total_variation(thin, (0.4, 0.3, 0.2))
-    assert value.item() == pytest.approx(squares.sqrt().mean().item(), rel=1e-12)
+    assert value.item() == pytest.approx(total, rel=1e-12)
     value.backward()
     assert bool(torch.isfinite(thin.grad).all())
 

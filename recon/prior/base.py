@@ -17,9 +17,9 @@ from torchdic import Volume
 
 @dataclass(frozen=True, eq=False)
 class Majorant:
-    """Mean over the voxels of edges·|∇Δn| + sparse·|Δn| + rough·½|∇Δn|²; ∇ is `differences`.
+    """Mean over the voxels of edges·|∇Δn| + sparse·|Δn| + rough·½|∇Δn|²; ∇ is that of `recon.prior.edges`.
 
-    edges: one weight, or one per voxel (z, y, x).
+    edges: one weight, one per voxel (z, y, x), or one per corner of each (corner, z, y, x).
     """
 
     edges: Tensor | float = 0.0

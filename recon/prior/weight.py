@@ -44,7 +44,7 @@ LEAST, MOST = 0.985, 1.2
 # Weight times the width of an edge that is usual. The noise of finite images is known to within its standard error.
 # Within UNSURE of these, where weights a factor of FAR apart lead to all but the same misfit, the usual weight is
 # preferred.
-USUAL, UNSURE, FAR = 0.8, 1.0, math.e
+USUAL, UNSURE, FAR = 1.0, 1.0, math.e
 
 # What the weight was from a step on, the misfit and the residual's whiteness there, and why it was changed, or not.
 WeightRecord = dict[str, Any]

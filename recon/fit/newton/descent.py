@@ -49,7 +49,7 @@ SHORTER, LONGER, BACK = 2.0, 0.4, 4.0
 UNTIL_CONTRAST, UNTIL_WEIGHT = 3, 2
 
 # Edges are wide at first, by this factor from one accepted step to the next: a logarithm at once keeps false edges.
-WIDE, NARROWER = 1.0 / EDGE, 0.7
+WIDE, NARROWER = 1.0 / EDGE, 0.85
 
 # Steps with the fewest directions.
 COARSE_STEPS = 4

@@ -1,4 +1,4 @@
-"""The differences of `recon.prior.edges`, periodic along y and x, and their adjoint: Newton's method inverts them."""
+"""The gradient of `recon.prior.edges`, periodic along y and x, and its adjoint: Newton's method inverts them."""
 
 import torch
 from jaxtyping import Float
@@ -32,3 +32,16 @@ def adjoint_differences(vectors: Float[Tensor, "3 z y x"], ratio: float) -> Floa
         out.narrow(axis, 1, last).add_(vectors[axis].narrow(axis, 0, last))
         out.narrow(axis, 0, 1).add_(vectors[axis].narrow(axis, last, 1))
     return out
+
+
+def at_corner(differences: Float[Tensor, "3 z y x"], corner: tuple[int, int, int]) -> Float[Tensor, "3 z y x"]:
+    """The gradient at one of the CORNERS, from the `forward_differences`."""
+    return torch.stack(
+        [along.roll(back, axis) for axis, (along, back) in enumerate(zip(differences, corner, strict=True))]
+    )
+
+
+def from_corner(gradient: Float[Tensor, "3 z y x"], corner: tuple[int, int, int]) -> Float[Tensor, "3 z y x"]:
+    """The adjoint of `at_corner`, which is its inverse: each difference belongs to one voxel at each corner."""
+    back_z, back_y, back_x = corner
+    return at_corner(gradient, (-back_z, -back_y, -back_x))

@@ -2,8 +2,9 @@
 
     minimise ½x·Bx − q·x + Σ edges·|Dx| + sparse·|x| + rough·½|Dx|²,   lower ≤ x ≤ upper
 
-Dx and a copy y of x are variables of their own, with multipliers u and v (scaled), so that each corner is met by a
-closed form and x by one linear solve (S. Boyd et al., Foundations and Trends in Machine Learning 3, 1, 2011, 6.4).
+D is the gradient at each of the prior's corners of the voxels, of which the sum is a mean. Dx and a copy y of x are
+variables of their own, with multipliers u and v (scaled), so that each term that isn't smooth is met by a closed form
+and x by one linear solve (S. Boyd et al., Foundations and Trends in Machine Learning 3, 1, 2011, 6.4).
 """
 
 from collections.abc import Callable
@@ -14,8 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
-from recon.fit.newton.differences import adjoint_differences, forward_differences
+from recon.fit.newton.differences import adjoint_differences, at_corner, forward_differences, from_corner
 from recon.prior.base import Majorant
+from recon.prior.edges import CORNERS
 
 # Rounds in each model. The multipliers go on from one model to the next.
 ROUNDS = 20
@@ -26,13 +28,13 @@ class Split:
     """Where ADMM stands. free: x. edges, copy: the multipliers u and v, over their penalties."""
 
     free: Float[Tensor, "z y x"]
-    edges: Float[Tensor, "3 z y x"]
+    edges: Float[Tensor, "corner 3 z y x"]
     copy: Float[Tensor, "z y x"]
 
     @classmethod
     def at(cls, delta: Float[Tensor, "z y x"]) -> "Split":
         """Anew, at a volume."""
-        return cls(delta, delta.new_zeros(3, *delta.shape), torch.zeros_like(delta))
+        return cls(delta, delta.new_zeros(len(CORNERS), 3, *delta.shape), torch.zeros_like(delta))
 
 
 @dataclass(frozen=True)
@@ -57,17 +59,22 @@ def minimised(
     solve: (B + rough·DᵀD + edges·DᵀD + copy)⁻¹ with the penalties' edges and copy. right: q. ratio: spacing along x
     over that along z.
     """
-    free, u, v = split.free, split.edges, split.copy
-    shrink = majorant.edges / penalties.edges
+    free, u, v = split.free, split.edges.clone(), split.copy
+    shrink = torch.as_tensor(majorant.edges).to(free).expand(len(CORNERS), *free.shape) / penalties.edges
     threshold = majorant.sparse / penalties.copy
     delta = free
     for _ in range(ROUNDS):
-        raised = forward_differences(free, ratio).add_(u)
-        length = raised.square().sum(0).sqrt_().clamp_min_(torch.finfo(free.dtype).tiny)
-        edges = raised * (1 - shrink / length).clamp_min_(0)
+        differences = forward_differences(free, ratio)
+        pull = torch.zeros_like(differences)
+        for corner, weight, multiplier in zip(CORNERS, shrink, u, strict=True):
+            raised = at_corner(differences, corner).add_(multiplier)
+            length = raised.square().sum(0).sqrt_().clamp_min_(torch.finfo(free.dtype).tiny)
+            edges = raised * (1 - weight / length).clamp_min_(0)
+            torch.sub(raised, edges, out=multiplier)
+            pull += from_corner(edges.sub_(multiplier), corner)
         lifted = free + v
         delta = bounds.clamped(lifted.sign() * (lifted.abs() - threshold).clamp_min(0))
-        u, v = raised - edges, lifted - delta
-        pull = adjoint_differences(edges - u, ratio).mul_(penalties.edges)
-        free = solve(right + pull.add_(delta - v, alpha=penalties.copy))
+        v = lifted - delta
+        pulled = adjoint_differences(pull, ratio).mul_(penalties.edges / len(CORNERS))
+        free = solve(right + pulled.add_(delta - v, alpha=penalties.copy))
     return delta, Split(free, u, v)
