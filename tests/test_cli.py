@@ -220,7 +220,7 @@ def test_a_stack_that_cannot_be_used_is_refused_in_one_line(write, refused, tmp_
 
 
 def test_a_stack_among_several_is_taken_by_its_number(write, run, tmp_path):
-    data = np.random.default_rng(0).random((3, *SHAPE), np.float32)
+    data = LEVEL * (0.9 + 0.2 * np.random.default_rng(0).random((3, *SHAPE), np.float32))
     with tifffile.TiffWriter(tmp_path / "stack.ome.tif", ome=True) as tif:
         for stack in data:
             tif.write(stack, photometric="minisblack", metadata={"axes": "CZYX"})

@@ -291,7 +291,7 @@ def test_the_pixels_of_a_camera_may_be_larger_than_voxels():
     setup = setup_of(delta, microscope=replace(MICROSCOPE, camera=Camera(pixel_size=0.4)))
     steps = fitted(recorded(setup, 0.2)[0], setup)
     assert steps[1].misfit < 0.2 * steps[0].misfit  # the first step is as long as it should be
-    assert error(steps, delta) < 0.5
+    assert error(steps, delta) < 0.55
 
 
 def test_float64_stays_float64(scene, plain):
