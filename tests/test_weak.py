@@ -60,6 +60,24 @@ def test_transfer_function_is_the_slope_of_the_image_in_each_slice(small, name, 
         assert float((found.real - expected).abs().max()) < 1e-8 * float(expected.abs().max())
 
 
+@pytest.mark.parametrize("plane", [None, 0.5])
+@pytest.mark.parametrize("name", ["projection", "rays"])
+def test_light_on_rays_goes_straight_on_to_the_reference_plane(name, plane):
+    """Bent rays too, to first order, but for their amplitude."""
+    grid, microscope = Grid((4, 24, 24), (0.5, 0.2, 0.2)), microscopes()["partially coherent"]
+    fidelity = replace(WAVE, propagation=name, amplitude=False, interpolation="cubic", reference_plane=plane or 0.0)
+    acquisition = Acquisition(PRISMS, (0.6, -0.9))
+    T = transfer_functions(grid, microscope, acquisition, N0, fidelity, dtype=torch.float64)
+    y, x = (grid.coordinates(axis, dtype=torch.float64) for axis in (1, 2))
+    ball = torch.exp(-(y[:, None].square() + x.square()) / (2 * 0.45**2))
+    for z in range(4):
+        delta = torch.zeros(grid.shape, dtype=torch.float64)
+        delta[z] = ball
+        expected = derivative(delta, grid, microscope, acquisition, fidelity)
+        found = applied(T, delta).real
+        assert float((found - expected).abs().max()) < 0.02 * float(expected.abs().max())
+
+
 @pytest.mark.parametrize("shape", [(3, 10, 12), (3, 9, 10), (2, 7, 9)])
 def test_transfer_function_of_absorption_is_the_slope_in_kappa(shape):
     grid, microscope = Grid(shape, (0.5, 0.2, 0.21)), microscopes()["partially coherent"]

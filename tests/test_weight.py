@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from recon.misfit.gaussian import GaussianMisfit
-from recon.prior.weight import LEAST, MODEL, MOST, TWICE, USUAL, FollowsNoise, reach, whiteness
+from recon.prior.weight import LEAST, MODEL, MOST, TWICE, USUAL, FollowsNoise, reach, record, whiteness
 
 NOISE = 0.2
 RULE = FollowsNoise(NOISE, 10**9)
@@ -16,7 +16,8 @@ WIDTH = USUAL / 10  # a weight of 10 is a usual one
 
 
 def following(misfit, white=1.0, before=None, rule=RULE, weights=(10.0,)):
-    return rule.next(weights, misfit, before, white, WIDTH)
+    past = [record(step, weight, "", 0.5) for step, weight in enumerate(weights)]
+    return rule.next(past, misfit, before, white, WIDTH)
 
 
 def test_the_aim_is_the_residuals_noise_and_the_least_that_a_model_of_voxels_leaves():
@@ -92,3 +93,17 @@ def test_white_noise_is_white_and_a_blurred_residual_is_not(sides):
 def test_images_too_small_for_high_frequencies_count_as_white():
     data = torch.randn(1, 2, 2, 2, generator=torch.Generator().manual_seed(0))
     assert whiteness(torch.zeros_like(data), GaussianMisfit(data)) > 0
+
+
+def test_a_weight_that_was_lowered_in_vain_goes_back_and_stays():
+    """As with straight rays where light is bent: the misfit can't reach the noise, whatever the weight."""
+    far = 3 * NOISE
+    past = [record(0, 20.0, ""), record(5, 10.0, "", far)]
+    assert RULE.next(past, 0.95 * far, None, 0.3, WIDTH) == (20.0, "the model holds the misfit up")
+    past.append(record(6, 20.0, "", 0.95 * far))
+    assert RULE.next(past, far, None, 0.3, WIDTH)[0] == 20.0
+    # from where it helped, it is lowered further
+    assert RULE.next(past[:2], 0.6 * far, None, 0.5, WIDTH)[0] < 10
+    # near the aim no step is in vain
+    near = 1.1 * NOISE
+    assert RULE.next([record(0, 20.0, ""), record(5, 10.0, "", near)], near, None, 1 / 1.1, WIDTH)[0] < 10

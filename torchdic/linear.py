@@ -13,6 +13,10 @@ The prism is a factor. Without bias D(0) = 0, so DIC has no linear response at a
 of a single source is its Ewald sphere, a delta function at (p_z − p_z0)/λ; as a function of depth it is smooth, so T is
 computed for depths.
 
+On rays what a slice scatters goes straight on along its source's direction p0 up to the reference plane z_r, and
+spreads from there: z_f − z_r takes the place of z_f − z, p_z0 that of p_z in n0/p_z, and exp(2πi (z − z_r) f·p0/p_z0)
+is a further factor. What bent rays do to the amplitude is left out.
+
 T. J. Holmes and W. J. Levy, Appl. Opt. 26, 3929 (1987); M. Born and E. Wolf, Principles of Optics, 13.1;
 N. Streibl, J. Opt. Soc. Am. A 2, 121 (1985) for the bright field.
 """
@@ -31,6 +35,7 @@ from torchdic.instrument.microscope import Acquisition, Microscope, check_apertu
 from torchdic.instrument.prism import Prism
 from torchdic.memory.batches import sum_over_sources
 from torchdic.plane_waves import exp_i, to_field, to_spectrum
+from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
 from torchdic.propagation.split_step import LOWEST_PZ
 from torchdic.scalar import number, scalar
@@ -79,7 +84,7 @@ def transfer_function(
 
     prism: None is bright field.
     background: refractive index of the medium.
-    fidelity: only `sources`, `steps` and `memory` matter.
+    fidelity: only `propagation`, `sources`, `steps` (of the wave), `reference_plane` (of rays) and `memory` matter.
     focus: depth z_f in µm.
     absorption: whether T is per unit of κ instead of Δn.
     dtype, device: of the real numbers; those of `background` where it is a tensor and none are given.
@@ -128,7 +133,7 @@ def linear_image(
 ) -> Float[Tensor, "prism focus y x"]:
     """The image of a specimen to first order in Δn and κ, relative to the empty bright field.
 
-    The weaker the specimen, the better it agrees with `image` by split-step propagation. Arguments as of `image`,
+    The weaker the specimen, the better it agrees with `image`. Arguments as of `image`,
     errors as of `transfer_function`.
     """
     pad = fidelity.padding
@@ -204,7 +209,8 @@ def _kernel_of_colour(
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """`_kernel` in light of one wavelength."""
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
-    depths, overlaps = _slabs(grid, fidelity, dtype, device)
+    spreads, plane = propagation_of(fidelity).spreads, fidelity.reference_plane or 0.0
+    depths, overlaps = _slabs(grid, fidelity.steps if spreads else None, dtype, device)
     momentum, weights = microscope.sources(fidelity.sources, dtype=dtype, device=device)
     foci = torch.stack([scalar(z, momentum) for z in acquisition.focus])
 
@@ -214,10 +220,16 @@ def _kernel_of_colour(
         passed = pupil.through(torch.ones_like(pupil.pz)[:, None]).squeeze(1)
         # passed at f = 0 is the unscattered wave: a source that misses the pupil has no cross term
         pz = pupil.pz.clamp_min(LOWEST_PZ)
+        to_focus, to_slice = foci, depths
+        beating = pupil.difference
+        if not spreads:
+            to_focus, to_slice = foci - plane, depths - plane
+            pz = pz[:, :1, :1]
+            beating = -microscope.wavelength * torch.einsum("sa,ayx->syx", momentum, frequencies) / pz
         cross = weights[:, None, None] * passed[:, :1, :1].conj() * passed * (background / pz)
         # exp(i k0 (z_f − z) q) is a product, so that a matrix product sums the sources for all foci and slices at once
-        at_focus = exp_i(k0 * foci[:, None, None, None] * pupil.difference) * cross
-        at_slice = exp_i(-k0 * depths[:, None, None, None] * pupil.difference)
+        at_focus = exp_i(k0 * to_focus[:, None, None, None] * pupil.difference) * cross
+        at_slice = exp_i(-k0 * to_slice[:, None, None, None] * beating)
         if overlaps is None:
             at_slice = at_slice * grid.spacing[0]
         else:
@@ -236,13 +248,14 @@ def _kernel_of_colour(
 
 
 def _slabs(
-    grid: Grid, fidelity: Fidelity, dtype: torch.dtype, device: torch.device
+    grid: Grid, steps: int | None, dtype: torch.dtype, device: torch.device
 ) -> tuple[Float[Tensor, " slab"], Float[Tensor, "slab z"] | None]:
     """Depths in µm of split-step propagation's slabs, and the length in µm over which each overlaps each slice.
 
-    The lengths are None where slabs and slices are the same.
+    steps: number of slabs; None is that of the slices. The lengths are None where slabs and slices are the same.
     """
-    nz, steps, extent = grid.shape[0], fidelity.steps or grid.shape[0], grid.extent[0]
+    nz, extent = grid.shape[0], grid.extent[0]
+    steps = steps or nz
     faces, borders = ((torch.arange(n + 1, dtype=torch.float64) / n - 0.5) * extent for n in (steps, nz))
     depths = ((faces[1:] + faces[:-1]) / 2).to(device, dtype)
     if steps == nz:

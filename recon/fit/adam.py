@@ -112,5 +112,5 @@ def _followed(
     if math.isnan(before):
         before = math.inf if step < UNTIL_CONTRAST * problem.steps else None
     white, width = whiteness(images, problem.misfit), EDGE * max(contrast(delta), 1e-9)
-    weight, reason = problem.weight.next([past["tv"] for past in weights], misfit, before, white, width)
+    weight, reason = problem.weight.next(weights, misfit, before, white, width)
     return (*weights, record(step + 1, weight, reason, misfit, white))

@@ -1,7 +1,8 @@
 """The prior's weight: it follows the noise.
 
 The true specimen leaves the noise's misfit (V. A. Morozov's discrepancy principle). A volume that leaves less follows
-the noise, and gets more weight; one that leaves more is held back by the prior, and gets less.
+the noise, and gets more weight; one that leaves more is held back by the prior, and gets less. Where less weight
+doesn't help, it is the model that errs, and the weight stays.
 
 A per cent of the noise's variance changes the weight by a third, and before the fit no noise is known as well as that.
 The residual tells it: what the specimen scatters lies at low frequencies, noise is as strong at high ones. Where the
@@ -33,6 +34,10 @@ GAIN, TWICE, AGAIN = 15.0, 2.0, 1.2
 
 # A misfit that fell by more than this share in the last step is still on its way.
 FALLING = 0.03
+
+# Where the misfit is more than BEYOND times its aim, and the last lower weight has LEFT more than this share of what
+# lies above the aim, not the priors hold the misfit up but the model: other optics, or light that it can't follow.
+BEYOND, LEFT = 1.2, 0.75
 
 # Frequencies above this many cycles per pixel, along y or x, are high.
 HIGH = 0.35
@@ -78,20 +83,31 @@ class FollowsNoise:
         return noise * (1 - unsure) + MODEL * max(0.0, 1 - noise)
 
     def next(
-        self, weights: Sequence[float], misfit: float, before: float | None, white: float, width: float
+        self, past: Sequence[WeightRecord], misfit: float, before: float | None, white: float, width: float
     ) -> tuple[float, str]:
         """The next weight, and the reason.
 
-        weights: so far, the oldest first. misfit: of the current volume. before: the misfit one accepted step earlier;
-        None at first. white: `whiteness` of the current residual. width: of an edge, in Δn.
+        past: records of the weights so far, the oldest first. misfit: of the current volume. before: the misfit one
+        accepted step earlier; None at first. white: `whiteness` of the current residual. width: of an edge, in Δn.
         """
+        weights = [record["tv"] for record in past]
         weight = weights[-1]
         aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"
+        if misfit > BEYOND * aim and (held := _in_vain(past, misfit, aim)) is not None:
+            return held, "the model holds the misfit up"
         longest = reach(weights)
         factor = math.exp(min(max(GAIN * math.log(aim / misfit), -longest), longest))
         return weight * factor, "the volume follows the noise" if factor > 1 else "the priors hold the volume back"
+
+
+def _in_vain(past: Sequence[WeightRecord], misfit: float, aim: float) -> float | None:
+    """The weight before the last lower one, where that has hardly brought the misfit nearer to its aim."""
+    for earlier, later in reversed(list(pairwise(past))):
+        if later["tv"] < earlier["tv"]:
+            return earlier["tv"] if misfit - aim > LEFT * (later["misfit"] - aim) else None
+    return None
 
 
 def record(

@@ -46,12 +46,15 @@ class Propagation(ABC):
     """One way for light to cross a specimen.
 
     name: by which a `Fidelity` calls it.
+    spreads: whether what a weak slice scatters spreads by diffraction up to the reference plane; on rays it goes
+        straight on along its source's direction.
     carries_polarisation: whether its light carries its polarisation along, which matters behind strained lenses.
     small_batches: whether small batches of sources are faster than large ones whose steps are computed again.
     holds_by_content: whether its memory depends on how much of the array is empty.
     """
 
     name: ClassVar[str]
+    spreads: ClassVar[bool] = True
     carries_polarisation: ClassVar[bool] = False
     small_batches: ClassVar[bool] = False
     holds_by_content: ClassVar[bool] = False

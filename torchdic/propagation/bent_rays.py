@@ -21,6 +21,7 @@ class BentRays(Propagation):
     """Rays that bend along the gradient of the index."""
 
     name = "rays"
+    spreads = False
     carries_polarisation = True
     small_batches = True
     # rays that go straight on land just on pixels, which gives 8 pairs of triangle and pixel to test per pixel, not 2

@@ -28,6 +28,7 @@ class Projection(Propagation):
     """Straight rays along each source's direction."""
 
     name = "projection"
+    spreads = False
 
     def prepare(self, volume: Volume, fidelity: Fidelity, plane: float, *, polarised: bool = False) -> "StraightRays":
         """The straight rays through a volume."""

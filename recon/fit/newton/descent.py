@@ -334,8 +334,8 @@ class _Descent:
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
         white = whiteness(now.images, self.problem.misfit)
-        weights = [past["tv"] for past in place.records] or [place.weight]
-        weight, reason = rule.next(weights, now.misfit, place.before, white, EDGE * place.scale)
+        past = place.records or (record(0, place.weight, "by the contrast"),)
+        weight, reason = rule.next(past, now.misfit, place.before, white, EDGE * place.scale)
         made = record(number + 1, weight, reason, now.misfit, white)
         return replace(place, weight=weight, records=(*place.records, made))
 
