@@ -263,7 +263,7 @@ def propagations(options: argparse.Namespace) -> None:
             for method in ("newton", "adam"):
                 if (fidelity.propagation, method) == ("wave", "adam"):
                     continue
-                found = fit(scene, Recipe(method=method, steps=40 if method == "adam" else None), fidelity)
+                found = fit(scene, Recipe(method=method, steps=80 if method == "adam" else None), fidelity)
                 inside = scene.truth > 0.9 * scene.truth.max()
                 centre = float(found.delta[inside].mean() / scene.truth[inside].mean())
                 print(row(f"{name}, {fidelity.propagation}, {method}, centre {centre:.2f}", found), flush=True)

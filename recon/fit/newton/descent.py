@@ -60,6 +60,10 @@ PENALTY = 0.4
 # Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
 TIKHONOV = 0.03
 
+# Where the renewed correction makes a step raise the objective by more than this share, the step is taken back too: draft
+# images lead astray there.
+CREEP = 2e-3
+
 # Where a trial's light can't be followed, the trial is taken back.
 NO_IMAGES = (UnstableError, SidewaysError, TurnedRaysError)
 
@@ -379,17 +383,13 @@ class _Descent:
         if share < BAD:
             there = self.judged(formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
-        factor = LONGER if share > GOOD else SHORTER if share < POOR else 1.0
-        onward = replace(
-            onward,
-            damping=max(factor * place.damping, LEAST),
-            accepted=place.accepted + 1,
-            before=now.misfit,
-            moved=True,
-            still=still,
-        )
+        onward = replace(onward, accepted=place.accepted + 1, before=now.misfit, moved=True, still=still)
         there, onward = self.renewed(onward, formed, *drafted)
-        return replace(onward, pairs=self.remembered(place, now, there, step)), there
+        pairs, rise = self.remembered(place, now, there, step), there.misfit - now.misfit + penalties
+        if rise > CREEP * objective:
+            return self.taken_back(place), now
+        factor = SHORTER if share < POOR or rise > 0 else LONGER if share > GOOD else 1.0
+        return replace(onward, damping=max(factor * place.damping, LEAST), pairs=pairs), there
 
     def remembered(self, place: Place, now: Judged, there: Judged, step: Tensor) -> tuple[Pair, ...]:
         """The pairs with that of a step added."""
