@@ -138,6 +138,7 @@ def test_the_objective_of_a_given_weight_never_rises(prior, height):
     assert losses[-1] < 0.3 * losses[0]
 
 
+@SLOW
 def test_a_step_that_careful_images_call_worse_is_taken_back():
     """Two directions mislead at a Δn of 0.2: without the law the objective rises by 3 % in a step."""
     setup, careful = setup_of(bead(0.2)), replace(FIDELITY, sources=48)

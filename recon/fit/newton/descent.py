@@ -60,8 +60,8 @@ PENALTY = 0.4
 # Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
 TIKHONOV = 0.03
 
-# Where the renewed correction makes a step raise the objective by more than this share, the step is taken back too: draft
-# images lead astray there.
+# Where the renewed correction makes a step raise the objective by more than this share, the step is taken back too:
+# draft images lead astray there.
 CREEP = 2e-3
 
 # Where a trial's light can't be followed, the trial is taken back.
