@@ -219,7 +219,7 @@ def stuck(options: argparse.Namespace) -> None:
     print(HEAD)
     print(row("clean", fit(scene)), flush=True)
     stack = Stack(spoiled.numpy())
-    found = stuck_pixels(stack.data, sharpest(scene.microscope, scene.grid.spacing[1:]))
+    found = stuck_pixels(stack.data, sharpest(scene.microscope, scene.grid.spacing[1:], scene.background))
     for name, seen in (("left out", left_out(stack, stuck=found)), ("counted", LeftOut())):
         prisms = [prism for prism in scene.acquisition.prisms if prism is not None]
         focus = tuple(map(float, scene.acquisition.focus))
@@ -239,7 +239,7 @@ def support(options: argparse.Namespace) -> None:
     for name in options.names or ("two beads", "cell", "bead", "cell, 400 photons"):
         scene, usual = scenes.scene(name, options.cache), Recipe(method=options.method)
         focus, true = [float(z) for z in scene.acquisition.focus], (scene.truth != 0).numpy()
-        edges = edges_support(scene.data.numpy(), focus, scene.grid, scene.microscope)
+        edges = edges_support(scene.data.numpy(), focus, scene.grid, scene.microscope, scene.background)
         known = np.asarray(ndimage.binary_dilation(true, np.ones((3, 3, 3), bool)), bool)
         everywhere, held = np.ones(true.shape, bool), usual
         for kind, voxels in (("none", everywhere), ("edges", edges), ("the truth's, widened by a voxel", known)):

@@ -242,8 +242,8 @@ def test_an_extinct_prisms_counts_ask_for_a_scale(write, refused, tmp_path):
 
 BAD_VALUES = [
     ("microscope.wavelength", -0.546, ["microscope", "wavelength -0.546", "above 0"]),
-    ("microscope.objective", {"na": 1.7}, ["objective NA 1.7", "index 1.5"]),
-    ("microscope.condenser", {"na": 1.7}, ["condenser NA 1.7", "index 1.5"]),
+    ("microscope.objective", {"na": 1.9}, ["objective NA 1.9", "at most 1.8"]),
+    ("microscope.condenser", {"na": 1.9}, ["condenser NA 1.9", "at most 1.8"]),
     ("microscope.wavelenght", 0.5, ["microscope.wavelenght", "did you mean 'wavelength'"]),
     ("volume.shape", [4, 0, 12], ["volume", "(4, 0, 12)", "at least 1"]),
     ("volume.shape", [0, 0, 0], ["volume", "(0, 0, 0)", "at least 1"]),
@@ -438,3 +438,32 @@ def test_a_reconstruction_without_room_is_refused_before_it_begins(
     line = refused("reconstruct", write({f"reconstruction.{key}": value for key, value in recipe.items()}))
     assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before
+
+
+OIL = {"volume.background": 1.335, "volume.spacing": [0.5, 0.1, 0.1], "microscope.condenser.na": 0.7}
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")
+@pytest.mark.parametrize(("na", "lines"), [(1.33, 0), (1.4, 1), (1.45, 1)])
+def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is_dark(write, run, na, lines):
+    code, said = run("simulate", write(OIL | {"microscope.objective.na": na}))
+    assert code == 0
+    assert len(said) == lines
+    for line in said:
+        assert line.startswith(f"torchdic: warning: objective NA {na} exceeds the medium's index 1.335")
+        assert "dark" in line
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")
+@pytest.mark.parametrize("more", [{}, {"fidelity": ..., "tolerance": 0.3}])
+def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, more):
+    """With oil behind 3 µm of water, the condenser's too, and with a planned fidelity."""
+    layer = {"thickness": 3.0, "index": 1.335, "design_index": 1.515}
+    path = write(OIL | {"microscope.objective": {"na": 1.4, "layer": layer}, "microscope.condenser.na": 1.4} | more)
+    assert run("simulate", path, out=tmp_path)[0] == 0
+    code, said = run("reconstruct", path)
+    assert code == 0
+    dark = [line for line in said if "is dark" in line]
+    assert len(dark) == 1
+    assert "objective NA 1.4" in dark[0]
+    assert "condenser NA 1.4" in dark[0]

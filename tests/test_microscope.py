@@ -140,25 +140,6 @@ def test_undersampling_is_reported_once_and_computed(spacing):
     assert images.shape == (2, 2, 10, 10)
 
 
-@pytest.mark.parametrize("compute", ["image", "image_field"])
-@pytest.mark.parametrize(
-    ("objective", "condenser", "message"),
-    [
-        (1.4, 0.3, r"objective NA 1\.4 exceeds the medium's index 1\.36"),
-        (0.7, 1.4, r"condenser NA 1\.4 exceeds the medium's index 1\.36"),
-        (0.7, 1.36, r"condenser direction .* 1\.36 must stay below the medium's index 1\.36"),
-    ],
-)
-def test_apertures_beyond_the_mediums_index_are_errors(compute, objective, condenser, message):
-    scope = Microscope(0.546, Objective(objective), Condenser(condenser))
-    calls = {
-        "image": lambda: image(empty(), scope, Acquisition()),
-        "image_field": lambda: image_field(torch.ones(12, 15), GRID, scope, Acquisition(), background=N0),
-    }
-    with pytest.raises(ValueError, match=message):
-        calls[compute]()
-
-
 def test_points_beyond_the_mediums_index_are_an_error():
     scope = Microscope(0.546, None, Condenser(0.3, points=torch.tensor([[1.0, 1.0]])))
     with pytest.raises(ValueError, match=r"1\.41421 must stay below the medium's index 1\.36"):

@@ -313,7 +313,7 @@ def test_gradients_are_central_differences(name, at_zero, smooth_field):
         (lambda: Layer(math.inf, 1.5, 1.5), r"layer thickness inf µm must be a finite number"),
         (lambda: Layer(1.0, 0.9, 1.5), r"layer index 0\.9 must be a refractive index of at least 1"),
         (lambda: Layer(1.0, 1.5, math.nan), r"layer design_index nan must be"),
-        (lambda: Objective(1.4, layer=Layer(1.0, 1.33, 1.515)), r"objective NA 1\.4 exceeds the layer's index 1\.33"),
+        (lambda: Objective(1.4, layer=Layer(1.0, 1.515, 1.33)), r"objective NA 1\.4 exceeds .* design_index 1\.33"),
     ],
 )
 def test_impossible_layers_are_errors(make, message):

@@ -13,7 +13,7 @@ from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objecti
 GRID = Grid((10, 32, 36), (0.3, 0.2, 0.2))
 MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.6))
 USUAL = ((0.0, 0.24), (0.24, 0.0))
-RATIO = sharpest(MICROSCOPE, (0.2, 0.2))
+RATIO = sharpest(MICROSCOPE, (0.2, 0.2), 1.36)
 
 
 def recorded(*beads, bias=1.4, focus=(-1.0, 0.0, 1.0), noise=0.0, microscope=MICROSCOPE):
@@ -102,6 +102,6 @@ def test_a_spot_is_as_sharp_as_the_objective_permits():
     v = 2 * math.pi * 0.9 * np.hypot(fine[:, None], fine) / 0.546
     bessel = sum((-1) ** k * (v / 2) ** (2 * k + 1) / math.factorial(k) / math.factorial(k + 1) for k in range(20))
     parts = ((2 * bessel / v) ** 2).reshape(3, 200, 3, 200).sum((1, 3))
-    assert sharpest(MICROSCOPE, (0.1, 0.2)) == pytest.approx(2 * parts[1, 1] / parts[1, 2], rel=1e-3)
-    assert sharpest(MICROSCOPE, (0.01, 0.01)) == 4.0
-    assert sharpest(MICROSCOPE, (2.0, 2.0)) == sharpest(Microscope(0.546), (0.2, 0.2)) == 20.0
+    assert sharpest(MICROSCOPE, (0.1, 0.2), 1.36) == pytest.approx(2 * parts[1, 1] / parts[1, 2], rel=1e-3)
+    assert sharpest(MICROSCOPE, (0.01, 0.01), 1.36) == 4.0
+    assert sharpest(MICROSCOPE, (2.0, 2.0), 1.36) == sharpest(Microscope(0.546), (0.2, 0.2), 1.36) == 20.0

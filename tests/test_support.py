@@ -113,19 +113,19 @@ def test_in_a_margin_the_support_goes_on(data, half):
 def test_the_support_of_edges_holds_the_specimen_and_is_smaller_than_the_volume(centre, noise):
     """Also of one that the field's edge cuts."""
     bead = Bead(0.9, 0.04, 1.45, centre)
-    support = edges_support(images_of(bead, noise).numpy(), FOCUS, GRID, MICROSCOPE)
+    support = edges_support(images_of(bead, noise).numpy(), FOCUS, GRID, MICROSCOPE, 1.45)
     assert bool(support[bead.delta(GRID).numpy() > 0].all())
     assert support.mean() < 0.7
 
 
 def test_the_order_of_planes_and_the_unit_play_no_part(data):
-    found = edges_support(data.numpy(), FOCUS, GRID, MICROSCOPE)
-    assert np.array_equal(edges_support(data.numpy()[:, ::-1], FOCUS[::-1], GRID, MICROSCOPE), found)
-    assert np.array_equal(edges_support(64 * data.numpy(), FOCUS, GRID, MICROSCOPE), found)
+    found = edges_support(data.numpy(), FOCUS, GRID, MICROSCOPE, 1.45)
+    assert np.array_equal(edges_support(data.numpy()[:, ::-1], FOCUS[::-1], GRID, MICROSCOPE, 1.45), found)
+    assert np.array_equal(edges_support(64 * data.numpy(), FOCUS, GRID, MICROSCOPE, 1.45), found)
 
 
 def test_images_without_edges_have_support_everywhere():
-    assert edges_support(np.full((2, 4, 32, 30), 0.5), FOCUS, GRID, MICROSCOPE).all()
+    assert edges_support(np.full((2, 4, 32, 30), 0.5), FOCUS, GRID, MICROSCOPE, 1.45).all()
 
 
 # by the command
@@ -179,7 +179,7 @@ def test_a_plane_mask_is_that_of_every_slice(run):
 def test_edges_are_the_support_where_asked_for(run, data):
     _, out, _, found, metrics = run(support="edges")
     assert "(support = edges)" in out
-    support = edges_support(data.numpy(), FOCUS, GRID, MICROSCOPE)
+    support = edges_support(data.numpy(), FOCUS, GRID, MICROSCOPE, 1.45)
     assert bool((found[~torch.from_numpy(support)] == 0).all())
     assert metrics["support"]["share"] == pytest.approx(support.mean())
     assert "support" not in run()[4]

@@ -11,6 +11,7 @@ the two beams. Intensity is relative to the empty bright field, so an empty DIC 
 """
 
 from torchdic.errors import (
+    ApertureWarning,
     SamplingWarning,
     ShortOfMemoryError,
     SidewaysError,
@@ -49,6 +50,7 @@ __all__ = [
     "REFERENCE",
     "STANDARD",
     "Acquisition",
+    "ApertureWarning",
     "Camera",
     "Candidate",
     "Condenser",

@@ -19,6 +19,10 @@ class SamplingWarning(UserWarning):
     """The grid is too coarse, or too narrow, for the light that the microscope lets through."""
 
 
+class ApertureWarning(UserWarning):
+    """An aperture exceeds the index of the medium, in which no light runs at so high an n·sinθ: that part is dark."""
+
+
 class UnstableError(ValueError):
     """The wave can't be computed in slabs: they make energy, or the index falls too low for light to go on toward +z.
 

@@ -31,7 +31,7 @@ from torch import Tensor
 from torchdic.fidelity import Fidelity
 from torchdic.grid import Grid
 from torchdic.imaging.pupil import Pupil, Waves
-from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures
+from torchdic.instrument.microscope import Acquisition, Microscope, in_medium
 from torchdic.instrument.prism import Prism
 from torchdic.memory.batches import sum_over_sources
 from torchdic.plane_waves import exp_i, to_field, to_spectrum
@@ -182,7 +182,7 @@ def _kernel(
     device: torch.device,
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
-    check_apertures(microscope, number(background))
+    microscope = in_medium(microscope, number(background), dtype)
     if microscope.lenses is not None:
         raise ValueError(
             "the linear transfer takes a prism's factor out of the sum over waves: it can't hold a polarisation pupil"

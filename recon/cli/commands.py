@@ -15,7 +15,7 @@ from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
-from torchdic import SamplingWarning, ShortOfMemoryError, ToleranceWarning
+from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
 from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 
@@ -120,7 +120,7 @@ def _show_each_warning_once() -> None:
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show
-    for kind in (SamplingWarning, ToleranceWarning):
+    for kind in (ApertureWarning, SamplingWarning, ToleranceWarning):
         warnings.simplefilter("always", kind)
 
 

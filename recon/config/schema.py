@@ -218,7 +218,7 @@ class Config:
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
         `torchdic.planning.work_precision.ladder`.
     Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
-    exceeds the medium's index, and for an empty list of candidates.
+    no lens has, for a condenser of which no light enters the medium, and for an empty list of candidates.
     """
 
     volume: VolumeSection

@@ -32,10 +32,10 @@ _FURTHER, _LEAST, _MOST = 2.0, 4.0, 20.0
 _ROUNDS = 3
 
 
-def sharpest(microscope: Microscope, pixel_size: tuple[float, float]) -> float:
+def sharpest(microscope: Microscope, pixel_size: tuple[float, float], background: float) -> float:
     """How far a pixel of a specimen's image may stand out of its neighbours, relative to these.
 
-    pixel_size: (y, x) in µm.
+    pixel_size: (y, x) in µm. background: refractive index of the medium.
 
     No detail is sharper than the objective's pass-band permits, 2·NA/λ: the smallest spot is the Airy pattern
     (2J₁(v)/v)², v = 2π·NA·r/λ. A spot in the middle of a pixel lights that and, by a smaller share, the next ones. The
@@ -44,7 +44,7 @@ def sharpest(microscope: Microscope, pixel_size: tuple[float, float]) -> float:
     if microscope.objective is None:
         return _MOST
     width = max(pixel_size)
-    scale = 2 * math.pi * microscope.objective.na / microscope.wavelength
+    scale = 2 * math.pi * microscope.objective.reach(background) / microscope.wavelength
 
     def light(centre: float) -> float:
         def airy(x: float, y: float) -> float:

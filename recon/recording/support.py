@@ -25,11 +25,16 @@ _CLOSED, _WIDENED = 3.0, 2.0
 
 
 def edges_support(
-    data: Float[np.ndarray, "prism focus y x"], focus: Sequence[float], grid: Grid, microscope: Microscope
+    data: Float[np.ndarray, "prism focus y x"],
+    focus: Sequence[float],
+    grid: Grid,
+    microscope: Microscope,
+    background: float,
 ) -> Bool[np.ndarray, "z y x"]:
     """The voxels (True) in which the specimen can be, as the edges of the sections in focus tell.
 
-    data: flattened and scaled. focus: of the planes, µm. grid: of the field, whose pixels the images have.
+    data: flattened and scaled. focus: of the planes, µm. grid: of the field, whose pixels the images have. background:
+    index of the medium.
 
     In each plane the squared Sobel gradients, over each prism's own noise of them and averaged over the prisms, are
     thresholded for the whole stack by the triangle method (at three times the median at least), gaps are closed and
@@ -37,7 +42,7 @@ def edges_support(
     smallest spots laterally, and by the depth of focus, so that it errs on the safe side: a voxel that is left out is
     lost to the fit, one too many costs next to nothing. It is everywhere where no plane shows an edge.
     """
-    aperture = microscope.objective.na if microscope.objective is not None else 1.0
+    aperture = microscope.objective.reach(background) if microscope.objective is not None else 1.0
     spot = microscope.wavelength / (2 * aperture)
     widths = [max(spot / spacing, _LEAST_WIDTH) for spacing in grid.spacing[1:]]
     energy = _edge_energy(data, widths)

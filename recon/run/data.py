@@ -63,7 +63,7 @@ def _left_out(config: Config, section: DataSection, stack: Stack) -> LeftOut:
     mask = None if section.mask is None else read_stack(section.mask).data != 0
     stuck = None
     if section.stuck is not None:
-        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:])
+        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:], config.volume.background)
         stuck = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask))
     found = left_out(stack, mask, stuck)
     if str(found):
@@ -80,7 +80,7 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     if named is None:
         return None
     if named == "edges":
-        found = edges_support(measured.data, measured.focus, grid, config.microscope)
+        found = edges_support(measured.data, measured.focus, grid, config.microscope, config.volume.background)
     else:
         mask = read_stack(named).data != 0
         if mask.shape not in ((1, *grid.shape), (1, 1, *grid.shape[1:])):

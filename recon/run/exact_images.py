@@ -8,6 +8,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic import Acquisition, Fidelity, Grid, Microscope, image_field
+from torchdic.instrument.microscope import limited
 
 # The exact field is computed on an array that is wider than the grid by this fraction on each side. Its images are
 # cropped to the grid, so that light which leaves the grid at one side doesn't come back in at the other.
@@ -65,10 +66,11 @@ def exact_images(
     _, ny, nx = grid.shape
     top, left = round(WIDENING * ny), round(WIDENING * nx)  # the same on both sides, so that the centre stays
     wide = grid.widened(top, left)
-    points, weights = microscope.sources(fidelity.sources, dtype=torch.float64, device=torch.device("cpu"))
+    lit = limited(microscope, specimen.background)
+    points, weights = lit.sources(fidelity.sources, dtype=torch.float64, device=torch.device("cpu"))
     na = None
     if microscope.objective is not None:
-        na = min(1.05 * microscope.objective.na, specimen.background)
+        na = min(1.05 * microscope.objective.reach(), specimen.background)
     total = torch.zeros(len(acquisition.prisms), len(acquisition.focus), *wide.shape[1:], dtype=torch.float64)
     for some, share in zip(points.split(SOURCES_AT_ONCE), weights.split(SOURCES_AT_ONCE), strict=True):
         part = replace(microscope.lit_from(some, share), camera=None)

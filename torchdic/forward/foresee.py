@@ -17,12 +17,13 @@ from torchdic.fidelity import Fidelity
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.forward.sample import Sample, VolumeSample, field_sample
 from torchdic.grid import Grid
-from torchdic.instrument.microscope import Acquisition, Microscope
+from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, limited
 from torchdic.memory.budget import Batches, Foreseen, fitted, least_of
 from torchdic.memory.free import check_room, free_bytes
 from torchdic.memory.signature import is_learned, signature
 from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
+from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
 # Bytes that a batch on the CPU may hold if no gradient is wanted. Its arrays then stay in the caches, which is up to
@@ -55,6 +56,8 @@ def foreseen(
         tensors require grad.
     If the fidelity names an object_aberration, its map is computed, because the memory depends on how strong it is.
     """
+    check_apertures(microscope, number(volume.background), volume.delta.dtype)
+    microscope = limited(microscope, number(volume.background), volume.delta.dtype)
     levels = 0
     if fidelity.object_aberration is not None:
         with torch.no_grad():

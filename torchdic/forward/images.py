@@ -8,7 +8,7 @@ from torchdic.fidelity import Fidelity
 from torchdic.forward.foresee import allot, allot_fields, check_fits
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.grid import Grid
-from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, check_sampling
+from torchdic.instrument.microscope import Acquisition, Microscope, check_sampling, in_medium
 from torchdic.propagation.presets import STANDARD
 from torchdic.scalar import number, scalar
 from torchdic.specimen.volume import Volume
@@ -24,11 +24,14 @@ def image(
     acquisition: the prisms and focus planes to image.
     fidelity: how carefully to compute.
     The result has the shape (prism, focus, y, x). Its pixels are the volume's (y, x) voxel centres, or those of a
-    camera that has a pixel size. Raises ValueError if an aperture exceeds the medium's index, and ShortOfMemoryError if
-    the computation needs more memory than is free. Warns with SamplingWarning if the voxels are coarser than the light.
+    camera that has a pixel size. Where an aperture exceeds the medium's index, the part beyond the index is dark, and
+    ApertureWarning says so. Raises ValueError for a condenser of which no wave enters the medium, and
+    ShortOfMemoryError if the computation needs more memory than is free. Warns with SamplingWarning if the voxels are
+    coarser than the light.
     """
-    check_apertures(microscope, number(volume.background), volume.delta.dtype)
-    check_sampling(microscope, volume.grid)
+    n0 = number(volume.background)
+    microscope = in_medium(microscope, n0, volume.delta.dtype)
+    check_sampling(microscope, volume.grid, n0)
     scene = volume, microscope, acquisition, fidelity
     if fidelity.object_aberration is None:
         batches = allot(*scene)
@@ -65,8 +68,8 @@ def image_field(
     if not transmission.is_complex():
         transmission = torch.complex(transmission, torch.zeros_like(transmission))
     real = transmission.real
-    check_apertures(microscope, number(background), real.dtype)
-    check_sampling(microscope, grid)
+    microscope = in_medium(microscope, number(background), real.dtype)
+    check_sampling(microscope, grid, number(background))
     momentum, _ = microscope.sources(fidelity.sources, dtype=real.dtype, device=real.device)
     expected = (*((len(momentum),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:

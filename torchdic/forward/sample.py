@@ -22,6 +22,7 @@ from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.memory.budget import Batches
 from torchdic.memory.held import Course, Growth, course_of, most
 from torchdic.memory.signature import stand_in
+from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
 # Pixels along a side of the sample: about so many, and as many as the scene has where those are fewer.
@@ -86,7 +87,7 @@ class VolumeSample:
     ) -> None:
         pad = fidelity.padding
         whole = volume.grid.widened(pad, pad)
-        sides, padding = _few_pixels(volume.grid, pad, microscope)
+        sides, padding = _few_pixels(volume.grid, pad, microscope, number(volume.background))
         self._grid = replace(volume.grid, shape=(volume.grid.shape[0], *sides))
         self.scale = math.prod(whole.shape[1:]) / math.prod(self._grid.widened(padding, padding).shape[1:])
         memory = max(1, int(fidelity.memory / self.scale))
@@ -126,7 +127,7 @@ class VolumeSample:
 def field_sample(passage: FieldPassage) -> tuple[Run, float]:
     """What computes a sample of fields, and the scene's pixels to one of the sample's."""
     fidelity, pad = passage.fidelity, passage.fidelity.padding
-    (ny, nx), padding = _few_pixels(passage.grid, pad, passage.microscope)
+    (ny, nx), padding = _few_pixels(passage.grid, pad, passage.microscope, number(passage.background))
     whole = passage.grid.widened(pad, pad)
     grid = Grid((1, ny, nx), passage.grid.spacing)
     scale = math.prod(whole.shape[1:]) / math.prod(grid.widened(padding, padding).shape[1:])
@@ -153,7 +154,7 @@ def _lit_by(microscope: Microscope, sources: int, fidelity: Fidelity) -> Microsc
     return microscope.lit_from(points[torch.arange(sources) % len(points)])
 
 
-def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple[int, int], int]:
+def _few_pixels(grid: Grid, padding: int, microscope: Microscope, background: float) -> tuple[tuple[int, int], int]:
     """The sample's sides (y, x) without padding, and its padding.
 
     Of the sizes that serve, the one in which a pupil's window and the coarser array for the intensities take about the
@@ -161,7 +162,7 @@ def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple
     """
     whole = grid.widened(padding, padding)
     wavelength = min(part.wavelength for part, _ in microscope.colours())
-    aimed = _parts(whole, wavelength, microscope)
+    aimed = _parts(whole, wavelength, microscope, background)
     best = None
     for side in SIDES:
         share = min(1.0, side / min(whole.shape[1:]))
@@ -169,17 +170,17 @@ def _few_pixels(grid: Grid, padding: int, microscope: Microscope) -> tuple[tuple
         sides = tuple(min(n, max(1, math.ceil(share * (n + 2 * padding)) - 2 * pad)) for n in grid.shape[1:])
         sides = (min(sides[0], side), min(sides[1], side))
         few = replace(grid, shape=(grid.shape[0], *sides)).widened(pad, pad)
-        differs = sum(abs(a - b) for a, b in zip(_parts(few, wavelength, microscope), aimed, strict=True))
+        differs = sum(abs(a - b) for a, b in zip(_parts(few, wavelength, microscope, background), aimed, strict=True))
         if best is None or differs < best[0]:
             best = differs, sides, pad
     assert best is not None
     return best[1], best[2]
 
 
-def _parts(grid: Grid, wavelength: float, microscope: Microscope) -> tuple[float, float]:
+def _parts(grid: Grid, wavelength: float, microscope: Microscope, background: float) -> tuple[float, float]:
     """The parts of the array's pixels that a pupil's window and the array for the intensities have."""
     objective = microscope.objective
-    found = None if objective is None else passband.sizes(grid, wavelength, objective.na)
+    found = None if objective is None else passband.sizes(grid, wavelength, objective.reach(background))
     if found is None:
         return 1.0, 1.0
     window, array = (math.prod(shape) / math.prod(grid.shape[1:]) for shape in found)

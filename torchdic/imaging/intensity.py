@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Complex, Float
@@ -17,6 +18,7 @@ from torchdic.imaging.pupil import Pupil, Waves
 from torchdic.imaging.wrap_around import Spread, check_wrap_around
 from torchdic.instrument.microscope import Acquisition, Microscope
 from torchdic.plane_waves import exp_i, to_field
+from torchdic.scalar import number
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +65,7 @@ class Imaging:
         """
         microscope, acquisition, components = self.microscope, self.acquisition, spectrum.shape[1]
         wavelength, objective = microscope.wavelength, microscope.objective
-        band = None if objective is None else Passband.around(self.grid, wavelength, objective.na, momentum)
+        band = None if objective is None else Passband.around(self.grid, wavelength, self._radius, momentum)
         if band is None:
             frequencies = self.grid.frequencies(dtype=momentum.dtype, device=momentum.device)
             shape = self.grid.shape[1:]
@@ -72,7 +74,7 @@ class Imaging:
         waves = Waves(self.grid, wavelength, self.background, momentum, frequencies)
         pupil = Pupil.of(objective, waves, self.defocus)
         spectrum = pupil.through(spectrum)
-        spread = Spread(waves, self.background if objective is None else objective.na, self.plane)
+        spread = Spread(waves, self._radius, self.plane)
         check_wrap_around(spectrum, spread, weights, acquisition, cut=self.band_limit)
         defocus = self._defocus(pupil.difference, spread)
         if microscope.lenses is not None:
@@ -82,6 +84,12 @@ class Imaging:
             seen_by_prism = frequencies if microscope.condenser_prism else waves.field_frequencies()
             images = self._scalar_images(spectrum.squeeze(1), defocus, seen_by_prism, weights, shape)
         return torch.stack(images).unflatten(0, (len(acquisition.focus), len(acquisition.prisms))).transpose(0, 1)
+
+    @cached_property
+    def _radius(self) -> float:
+        """The largest |p| of a wave that passes; found once, because on a GPU the program waits for it."""
+        n0, objective = number(self.background), self.microscope.objective
+        return n0 if objective is None else objective.reach(n0)
 
     def _defocus(self, difference: Tensor, spread: Spread) -> Iterator[Tensor]:
         """The factor (source, y, x) of each wave on its way to one focus after the other."""

@@ -34,7 +34,7 @@ class Spread:
     """
 
     waves: Waves
-    na: float | Tensor
+    na: float
     plane: float
 
     def distance(self, focus: float | Tensor) -> float:
@@ -70,7 +70,7 @@ class Spread:
     @cached_property
     def _steepest(self) -> tuple[float, float]:
         """The background's index, and the largest p/p_z of a wave."""
-        n0, most = number(self.waves.background), number(self.na)
+        n0, most = number(self.waves.background), self.na
         return n0, most / math.sqrt(n0**2 - most**2) if most < n0 else math.inf
 
     @property

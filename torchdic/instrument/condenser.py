@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -60,6 +60,7 @@ class Condenser:
     weights: the points' shares (source,) of the light, normalised to sum to 1; None means equal shares.
     inner_na: aperture below which a stop blocks the light; None is a full disc, and `na` itself is a thin ring.
 
+    Where `na` exceeds the medium's index, only the aperture below the index lights the specimen, see `limited`.
     Raises ValueError for a negative aperture or weight, weights without points, unequal numbers of the two, and an
     inner aperture that is above `na` or comes with points.
     """
@@ -96,6 +97,10 @@ class Condenser:
             if not (bool((weights >= 0).all()) and 0 < float(weights.sum()) < float("inf")):
                 raise ValueError("condenser weights must be at least 0, with a positive finite sum")
             object.__setattr__(self, "weights", weights)
+
+    def limited(self, most: float) -> "Condenser":
+        """The condenser whose aperture ends at `most`, from which all the light then comes; points stay as they are."""
+        return self if self.na <= most else replace(self, na=most)
 
     def sources(
         self,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchdic.errors import SamplingWarning
+from torchdic.errors import ApertureWarning, SamplingWarning
 from torchdic.grid import Grid
 from torchdic.instrument.camera import Camera
 from torchdic.instrument.condenser import Condenser, Spectrum
@@ -18,6 +18,12 @@ from torchdic.instrument.polarisation import Polarisation
 from torchdic.instrument.polarised_lenses import JonesPupil
 from torchdic.instrument.prism import Prism
 from torchdic.scalar import number
+
+# No lens has a larger aperture: the densest immersion has the index 1.78. A denser medium permits a larger one.
+LARGEST_NA = 1.8
+
+# Apertures and indices closer than this are the same, relatively.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +79,13 @@ class Microscope:
         """Whether lenses turn polarisation between pupil and specimen; bent rays then carry their polarisation."""
         return self.lenses is not None and self.lenses.depolarisation
 
-    @property
-    def reach(self) -> float:
-        """The largest transverse momentum n·sinθ in the image of an oblique source's envelope, NA_o + NA_c."""
-        condenser = 0.0 if self.condenser is None else self.condenser.na
-        return condenser + (0.0 if self.objective is None else self.objective.na)
+    def reach(self, background: float) -> float:
+        """The largest transverse momentum n·sinθ in the image of an oblique source's envelope, NA_o + NA_c.
+
+        background: refractive index of the medium; no aperture counts beyond it.
+        """
+        condenser = 0.0 if self.condenser is None else min(self.condenser.na, background)
+        return condenser + (0.0 if self.objective is None else self.objective.reach(background))
 
     def colours(self) -> list[tuple["Microscope", float]]:
         """For each wavelength of the light, a microscope of that wavelength and its share; the shares sum to 1."""
@@ -93,7 +101,7 @@ class Microscope:
     ) -> tuple[Float[Tensor, "source 2"], Float[Tensor, " source"]]:
         """Directions n·sinθ (source, 2) of the illumination and their weights (source,), see `Condenser.sources`."""
         condenser = self.condenser or Condenser(0.0)
-        pupil = None if self.objective is None else self.objective.na
+        pupil = None if self.objective is None else self.objective.reach()
         return condenser.sources(count, pupil=pupil, dtype=dtype, device=device)
 
     def lit_from(
@@ -129,30 +137,77 @@ class Acquisition:
 
 
 def check_apertures(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> None:
-    """Raise ValueError where an aperture exceeds the medium's index, so that no wave fills it.
+    """Raise ValueError for an aperture that no lens has, and where a condenser lights the specimen with no wave.
 
     background: refractive index of the medium.
     dtype: precision in which p_z = √(n² − |p|²) of each condenser direction must stay above 0 in spite of rounding.
     """
-    condenser = microscope.condenser
-    apertures = {"objective": microscope.objective, "condenser": condenser}
-    for name, part in apertures.items():
-        if part is not None and part.na > background:
-            raise ValueError(f"{name} NA {part.na:g} exceeds the medium's index {background:g}")
-    if condenser is not None:
-        largest = condenser.na if condenser.points is None else float(condenser.points.detach().norm(dim=-1).max())
-        if largest >= background * (1 - 4 * torch.finfo(dtype).eps):
+    condenser, largest = microscope.condenser, max(background, LARGEST_NA)
+    for name, part in (("objective", microscope.objective), ("condenser", condenser)):
+        if part is not None and part.na > largest:
+            raise ValueError(f"{name} NA {part.na:g} must be at most {largest:g}: no immersion has a higher index")
+    if condenser is None:
+        return
+    if condenser.points is not None:
+        steepest = float(condenser.points.detach().norm(dim=-1).max())
+        if steepest >= background * (1 - 4 * torch.finfo(dtype).eps):
             raise ValueError(
-                f"condenser direction n·sinθ {largest:g} must stay below the medium's index {background:g}"
+                f"condenser direction n·sinθ {steepest:g} must stay below the medium's index {background:g}"
             )
+    elif (condenser.inner_na or 0.0) > _below(background, dtype):
+        raise ValueError(
+            f"condenser inner NA {condenser.inner_na:g} must stay below the medium's index {background:g}: "
+            "no light enters the medium"
+        )
 
 
-def check_sampling(microscope: Microscope, grid: Grid) -> None:
+def limited(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> Microscope:
+    """The microscope whose condenser ends at the medium's index, beyond which its light doesn't enter the medium.
+
+    background: refractive index of the medium. A learned index gives the directions no gradient: they stay as they are.
+    dtype: precision in which each direction must stay below the index.
+
+    The objective keeps its aperture, in which its aberrations are declared: its pupil passes no evanescent wave.
+    """
+    if microscope.condenser is None:
+        return microscope
+    return replace(microscope, condenser=microscope.condenser.limited(_below(background, dtype)))
+
+
+def in_medium(microscope: Microscope, background: float, dtype: torch.dtype = torch.float64) -> Microscope:
+    """The microscope as `limited`, after `check_apertures`; warns with ApertureWarning of apertures beyond the index.
+
+    Arguments and errors as of these. The warning names the line of code two calls further out.
+    """
+    check_apertures(microscope, background, dtype)
+    objective, condenser = microscope.objective, microscope.condenser
+    beyond, hint = [], ""
+    # an index that float32 has rounded is still the same
+    if objective is not None and objective.na > objective.reach(background) * (1 + _ROUNDING):
+        lowest = objective.reach(background)
+        owner = "medium's" if math.isclose(lowest, background, rel_tol=_ROUNDING) else "layer's"
+        beyond.append(f"objective NA {objective.na:g} exceeds the {owner} index {lowest:g}")
+        if objective.layer is None:
+            hint = "; declare a mismatch of oil, glass and specimen as the objective's layer (Layer)"
+    if condenser is not None and condenser.na > background * (1 + _ROUNDING):
+        beyond.append(f"condenser NA {condenser.na:g} exceeds the medium's index {background:g}")
+    if beyond:
+        warnings.warn(f"{' and '.join(beyond)}: light beyond the index is dark{hint}", ApertureWarning, stacklevel=3)
+    return limited(microscope, background, dtype)
+
+
+def _below(background: float, dtype: torch.dtype) -> float:
+    """The largest aperture whose directions all have a p_z above 0 in spite of rounding."""
+    return background * (1 - 8 * torch.finfo(dtype).eps)
+
+
+def check_sampling(microscope: Microscope, grid: Grid, background: float) -> None:
     """Warn with SamplingWarning where voxels are too coarse for the light, or the array too small for the objective.
 
+    background: refractive index of the medium.
     The warnings name the line of code that called `image` or another function that checks: two calls further out.
     """
-    reach = microscope.reach
+    reach = microscope.reach(background)
     sides = [(n, d) for n, d in zip(grid.shape[1:], grid.spacing[1:], strict=True) if n > 1]
     coarsest = max((d for _, d in sides), default=0.0)
     shortest = min(part.wavelength for part, _ in microscope.colours())

@@ -69,7 +69,10 @@ class Objective:
     of even transmission.
     layer: a layer for which the objective is not designed; None is no such layer.
 
-    Raises ValueError for an aperture that isn't positive or exceeds a layer's index, and for a Noll index below 1.
+    An aperture may exceed the index of the medium or of the layer, as that of an oil objective on a specimen in water
+    does. No wave runs there at a higher n·sinθ than the index, so that the pupil is dark beyond it, see `reach`; the
+    Zernike terms keep the aperture as their unit radius. Raises ValueError for an aperture that isn't positive or
+    exceeds the layer's design_index, which the objective's own light would not cross, and for a Noll index below 1.
     """
 
     na: float
@@ -89,17 +92,27 @@ class Objective:
         if self.apodisation not in (None, "aplanatic"):
             raise ValueError(f"apodisation {self.apodisation!r} must be 'aplanatic' or absent")
         if self.layer is not None:
-            lowest = min(number(self.layer.index), number(self.layer.design_index))
-            if self.na > lowest:
-                raise ValueError(f"objective NA {self.na:g} exceeds the layer's index {lowest:g}")
+            design = number(self.layer.design_index)
+            if self.na > design:
+                raise ValueError(f"objective NA {self.na:g} exceeds the layer's design_index {design:g}")
+
+    def reach(self, background: float = math.inf) -> float:
+        """The radius of the part of the pupil that light can fill: the aperture, or an index if that is lower.
+
+        background: refractive index of the medium; without it only the layer's index counts.
+        """
+        return min(self.na, background, math.inf if self.layer is None else number(self.layer.index))
 
     def aperture(self, momentum: Float[Tensor, "source 2 y x"]) -> Tensor:
-        """Which waves lie within the aperture (source, y, x); its edge counts as inside.
+        """Which waves lie within the aperture (source, y, x) and run through the layer; its edge counts as inside.
 
         momentum: of each wave, n·sinθ as (y, x).
         """
-        rounding = 8 * torch.finfo(momentum.dtype).eps
-        return momentum.square().sum(1) <= self.na**2 * (1 + rounding)
+        rounding, squared = 8 * torch.finfo(momentum.dtype).eps, momentum.square().sum(1)
+        inside = squared <= self.na**2 * (1 + rounding)
+        if self.layer is None:
+            return inside
+        return inside & (squared < scalar(self.layer.index, squared).detach().square())
 
     def phase(self, momentum: Float[Tensor, "source 2 y x"]) -> Float[Tensor, "source y x"] | None:
         """The aberrations' phase in rad; None for a perfect lens. momentum: of each wave, n·sinθ as (y, x)."""

@@ -130,7 +130,9 @@ def product(
 
 def _tilt(t: Tensor) -> Tensor:
     """T(t): what the shortest turn of z to k does to x and y within their plane."""
-    cosine = (1 - t.square().sum(1)).sqrt()
+    squared = 1 - t.square().sum(1)
+    # rounding may take a grazing wave to 0, where the root has no slope
+    cosine = torch.where(squared > 0, torch.where(squared > 0, squared, 1).sqrt(), 0)
     outer = t[:, :, None] * t[:, None] / (1 + cosine)[:, None, None]
     return torch.eye(2, dtype=t.dtype, device=t.device)[:, :, None, None] - outer
 

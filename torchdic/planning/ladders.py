@@ -264,7 +264,7 @@ def needed_padding(scene: Scene) -> int:
     depths = [grid.centre(0, i) for i in filled[0]]
     distance = max(abs(number(z) - d) for z, d in itertools.product(acquisition.focus, depths))
     n0 = number(volume.background)
-    sine = min((n0 if microscope.objective is None else microscope.objective.na) / n0, 0.95)
+    sine = min((n0 if microscope.objective is None else microscope.objective.reach(n0)) / n0, 0.95)
     shear = max((abs(number(s)) for p in acquisition.prisms if p is not None for s in p.shear), default=0.0)
     reach = distance * sine / math.sqrt(1 - sine**2) + shear + BLUR * microscope.wavelength / (n0 * sine)
     beyond = max(reach / grid.spacing[a] - gap for a, gap in zip((1, 2), gaps, strict=True))

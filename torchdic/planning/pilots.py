@@ -77,7 +77,7 @@ class Scene:
         need finer ones.
         """
         grid, n0, objective = self.volume.grid, number(self.volume.background), self.microscope.objective
-        na = n0 if objective is None else objective.na
+        na = n0 if objective is None else objective.reach(n0)
         deepest = n0 * self.microscope.wavelength / (2 * na**2)
         steps = min(self.slices, max(COARSE, math.ceil(grid.extent[0] / deepest)))
         while steps < MOST_UNSTABLE * self.slices:

@@ -19,9 +19,16 @@ from typing import Any
 
 import torch
 
-from torchdic.errors import SamplingWarning, SlabWarning, ToleranceWarning, UnstableError, WrapAroundWarning
+from torchdic.errors import (
+    ApertureWarning,
+    SamplingWarning,
+    SlabWarning,
+    ToleranceWarning,
+    UnstableError,
+    WrapAroundWarning,
+)
 from torchdic.fidelity import Fidelity
-from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, check_sampling
+from torchdic.instrument.microscope import Acquisition, Microscope, check_sampling, in_medium
 from torchdic.planning.cost import seconds
 from torchdic.planning.effects import Effect, effects
 from torchdic.planning.image_error import relative
@@ -108,12 +115,13 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     """
     if not (isinstance(tolerance, Real) and 0 < tolerance < math.inf):
         raise ValueError(f"tolerance {tolerance} must be above 0, and finite")
-    check_apertures(microscope, number(volume.background))
-    check_sampling(microscope, volume.grid)
+    n0 = number(volume.background)
+    microscope = in_medium(microscope, n0, volume.delta.dtype)
+    check_sampling(microscope, volume.grid, n0)
     started = time.perf_counter()
     scene = Scene(_detached(volume), microscope, acquisition)
     with warnings.catch_warnings():
-        for about_pilots in (SamplingWarning, SlabWarning, WrapAroundWarning):
+        for about_pilots in (ApertureWarning, SamplingWarning, SlabWarning, WrapAroundWarning):
             warnings.simplefilter("ignore", about_pilots)
         chosen = _plan(scene, float(tolerance))
     chosen = replace(chosen, planning=time.perf_counter() - started)

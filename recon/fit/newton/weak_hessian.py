@@ -133,8 +133,10 @@ def axial_band(setup: Setup) -> int:
     has the frequency k/(2·depth).
     """
     microscope, background = setup.microscope, number(setup.volume.background)
-    apertures = [part.na for part in (microscope.objective, microscope.condenser) if part is not None]
-    na = min(max(apertures, default=background), background) if microscope.objective is not None else background
+    objective, condenser = microscope.objective, microscope.condenser
+    na = background
+    if objective is not None:
+        na = max(objective.reach(background), 0.0 if condenser is None else min(condenser.na, background))
     highest = (background - math.sqrt(max(background**2 - na**2, 0.0))) / microscope.wavelength
     return math.ceil(2 * setup.volume.grid.extent[0] * highest) + BEYOND
 
