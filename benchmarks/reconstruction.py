@@ -163,7 +163,6 @@ def ablation(options: argparse.Namespace) -> None:
         ("all directions in every step", replace(usual, draft_sources=None), None),
         ("10 steps", replace(usual, steps=10), None),
         ("40 steps", replace(usual, steps=40), None),
-        ("Adam, 150 steps", replace(usual, method="adam"), None),
     )
     table("without", ways, options)
     with patch.object(descent, "Secants", lambda hessian, _: Secants(hessian, ())):

@@ -29,8 +29,8 @@ def gradient_length(
     for axis, step in enumerate(spacing):
         if delta.shape[axis] > 1:
             onward = delta.diff(dim=axis, append=delta.narrow(axis, -1, 1)) * (spacing[2] / step)
-            both = torch.stack([onward, onward.roll(1, axis)]).square()
-            squares = squares + both[[corner[axis] for corner in CORNERS]]
+            both = onward.square(), onward.roll(1, axis).square()
+            squares = squares + torch.stack([both[corner[axis]] for corner in CORNERS])
     return squares.sqrt()
 
 
