@@ -48,7 +48,7 @@ from recon.report.verdict import Verdict, judged
 from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
 from recon.run.results import model_images
 from scenes import Scene
-from torchdic import Acquisition, Camera, Fidelity, Prism
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
 
@@ -270,7 +270,10 @@ def verdicts(options: argparse.Namespace) -> None:
 def mistakes(options: argparse.Namespace) -> None:
     """The cell with a deliberate mistake: what the verdict says is wrong."""
     scene = scenes.scene("cell", options.cache)
-    declared, wider = scene.acquisition, replace(scene.microscope, condenser=replace(scene.microscope.condenser, na=0.9))
+    declared, wider = (
+        scene.acquisition,
+        replace(scene.microscope, condenser=Condenser(0.9)),
+    )
 
     def sheared(change: Callable[[float, float], tuple[float, float]]) -> Acquisition:
         prisms = [replace(p, shear=change(*map(float, p.shear))) for p in declared.prisms if p is not None]
@@ -290,9 +293,15 @@ def mistakes(options: argparse.Namespace) -> None:
         "wavelength 0.633 for 0.546": replace(scene, microscope=replace(scene.microscope, wavelength=0.633)),
         "shear 1.3 times too long": replace(scene, acquisition=sheared(lambda y, x: (1.3 * y, 1.3 * x))),
         "nine hot pixels, counted": replace(scene, data=hot),
-        "one image of another plane": replace(scene, data=scene.data.index_copy(1, torch.tensor([6]), scene.data[:, 1:2])),
+        "one image of another plane": replace(
+            scene, data=scene.data.index_copy(1, torch.tensor([6]), scene.data[:, 1:2])
+        ),
     }
-    print("| mistake | error | misfit/noise | whiteness | warned | first | second | s of the search |\n" + "|---" * 8 + "|")
+    print(
+        "| mistake | error | misfit/noise | whiteness | warned | first | second | s of the search |\n"
+        + "|---" * 8
+        + "|"
+    )
     for name in options.names or made:
         found, verdict, seconds = judged_fit(made[name])
         causes = [f"{cause.name} ({cause.share:.0%})" for cause in verdict.causes[:2]] + ["–", "–"]

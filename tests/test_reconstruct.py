@@ -27,7 +27,7 @@ from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
 from recon.report.metrics import volume_error
 from recon.report.verdict import PoorFitWarning
-from recon.run import reconstruct, recorded, results
+from recon.run import reconstruct, recorded
 from recon.run.checkpoint import CheckpointError
 from torchdic import Grid, Volume, image
 from torchdic.files.stack import read_stack, read_volume, write_stack

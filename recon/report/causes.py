@@ -1,4 +1,4 @@
-"""What most likely is wrong where a volume leaves far more than noise does, from the residual and from a few short fits.
+"""What most likely is wrong where a volume leaves far more than noise does, by the residual and by a few short fits.
 
 A wrong sign, order or aperture leaves a residual that looks like the specimen, whatever the mistake. So the likely ones
 are tried: each is a descent of a few coarse steps beside one with what was declared. What explains the stack far better
@@ -28,11 +28,12 @@ from torchdic import Acquisition, Fidelity, Prism
 from torchdic.errors import SamplingWarning, SidewaysError, UnstableError, WrapAroundWarning
 from torchdic.scalar import number
 
-# Steps and condenser directions of a short fit. The benchmarks' cell has a misfit of 0.17 after them where all is right,
+# Steps and condenser directions of a short fit. The benchmarks' cell has a misfit of 0.17 after them if all is right,
 # and of 0.57 to 0.76 where a sign, the order of the planes or the axes are wrong.
 STEPS, SOURCES = 3, 12
 
-# A change that explains less than LEAST of what is unexplained is no cause; where one explains ENOUGH, no more is tried.
+# A change that explains less than LEAST of what is unexplained is no cause; after one that explains ENOUGH, no more is
+# tried.
 LEAST, ENOUGH = 0.25, 0.9
 
 # The condenser's aperture is tried wider and narrower by this factor.
@@ -44,6 +45,9 @@ MOST_PRISMS = 4
 # Where FEW of the pixels hold more than HALF of the squared residual, and their neighbours less than ALONE of theirs,
 # the pixels are stuck.
 FEW, HALF, ALONE = 0.01, 0.5, 0.25
+
+# What is less than this part of the noise isn't seen.
+STANDS_OUT = 0.1
 
 # The frame's width over the shorter side, and how many times the squared residual within it must be that of the rest.
 FRAME, BORDER = 1 / 10, 3.0
@@ -84,7 +88,7 @@ def ranked(causes: Sequence[Cause]) -> tuple[Cause, ...]:
     return tuple(sorted(causes, key=lambda cause: -cause.share))
 
 
-# --- what the residual shows -------------------------------------------------------------------------------------------
+# --- what the residual shows ------------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -97,7 +101,7 @@ def seen_in_residual(
     """
     residual = misfit.where_counted(images - misfit.data) / misfit.variance.sqrt()
     squares = residual.square()
-    excess = float((squares.mean() - noise).clamp_min(torch.finfo(squares.dtype).tiny))
+    excess = max(float(squares.mean()) - noise, STANDS_OUT * noise, 1e-12)
     yield from _stuck(squares.mean((0, 1)))
     level = float(residual.mean((2, 3)).square().mean())
     if level > HALF * excess:
@@ -138,7 +142,7 @@ def _cut(power: Float[Tensor, "y x"], noise: float) -> Iterator[Cause]:
         return
     total = float((power - noise).sum())
     frame = total - float((within - noise).sum())
-    ratio = frame / (power.numel() - within.numel()) / max(float((within - noise).mean()), 0.1 * abs(noise), 1e-12)
+    ratio = frame / (power.numel() - within.numel()) / max(float((within - noise).mean()), STANDS_OUT * noise, 1e-12)
     if ratio > BORDER and total > 0:
         yield Cause(
             "cut specimen",
@@ -166,12 +170,12 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
         yield Cause(
             "one image",
             min(1.0, float(power[p, f] - noise) / max(float((power - noise).sum()), 1e-12)),
-            f"prism {p}, plane {f} leaves {float(power[p, f]) / max(median, 1e-12):.1f} times what the median image does",
+            f"prism {p}, plane {f} leaves {float(power[p, f]) / max(median, 1e-12):.1f} times the median image's",
             "look at that image (moved, blurred, in the wrong place?) and mask it or leave it out",
         )
 
 
-# --- what short fits show ----------------------------------------------------------------------------------------------
+# --- what short fits show ---------------------------------------------------------------------------------------------
 
 
 def can_be_tried(problem: Problem) -> bool:
@@ -187,7 +191,7 @@ def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
     """The causes that explain the stack better in a short fit than what was declared does.
 
     misfit: of the finished volume. noise: what noise leaves of it. A fit whose light can't be followed explains
-    nothing. Without priors any fit comes closer, so it must come closer than the finished one.
+    nothing. Without priors any fit comes closer, so that one must come closer than the finished one.
     """
     declared = short_fit(problem)
     for variant in variants(problem):
@@ -218,19 +222,23 @@ def short_fit(problem: Problem) -> float:
 def variants(problem: Problem) -> Iterator[Variant]:
     """The problem with each likely mistake undone, the likeliest first; those that change nothing are left out."""
     setup = problem.setup
+    lower = _of_the_other_sign(problem)
+    if lower is not None:
+        advice = (
+            "let the bounds of Δn hold the other sign; or reverse every shear and acquisition.focus, which to first "
+            "order gives the same images"
+        )
+        yield Variant("Δn's sign", "Δn is on the other side of 0", advice, lower)
     seen = [_images_of(setup.acquisition)]
     for name, what, advice, acquisition in _acquisitions(setup.acquisition):
         made = _images_of(acquisition)
         if made not in seen:
             seen.append(made)
             yield Variant(name, what, advice, replace(problem, setup=replace(setup, acquisition=acquisition)))
-    lower = _of_the_other_sign(problem)
-    if lower is not None:
-        yield Variant("Δn's sign", "Δn is on the other side of 0", "change the bounds of Δn (reconstruction)", lower)
     for na, changed in _apertures(setup):
         advice = f"check the condenser's aperture diaphragm and immersion (na {na:.2g} explains more)"
         yield Variant("condenser", f"the condenser's na is nearer to {na:.2g}", advice, replace(problem, setup=changed))
-    if problem.priors:
+    if problem.priors and problem.weight is None:  # a weight that follows the noise isn't too strong
         advice = "lower reconstruction.tv and l1, or leave tv = 'auto'"
         yield Variant(PRIORS, "the priors are too strong", advice, replace(problem, priors=(), weight=None))
 
@@ -288,9 +296,14 @@ def _of_the_other_sign(problem: Problem) -> Problem | None:
     """The problem with Δn on the other side of 0; None where its bounds don't end there, or a support has its own."""
     index = next(unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference))
     bounds = index.bounds
-    if isinstance(bounds, SupportedBounds) or (bounds.lower is None) == (bounds.upper is None) or 0 not in (
-        bounds.lower,
-        bounds.upper,
+    if (
+        isinstance(bounds, SupportedBounds)
+        or (bounds.lower is None) == (bounds.upper is None)
+        or 0
+        not in (
+            bounds.lower,
+            bounds.upper,
+        )
     ):
         return None
     mirrored = Bounds(*(None if bound is None else -bound + 0.0 for bound in (bounds.upper, bounds.lower)))

@@ -1,8 +1,8 @@
 """Whether a volume explains its stack: the misfit over what noise leaves, what the residual looks like, and what to do.
 
-Noise alone leaves a known part of the misfit. A volume that leaves as much explains the stack, which doesn't say that it
-is right everywhere: what the apertures don't see, the priors fill in. One that leaves far more is wrong somewhere, and
-`recon.report.causes` looks for where.
+Noise alone leaves a known part of the misfit. A volume that leaves as much explains the stack, which doesn't say that
+it is right everywhere: what the apertures don't see, the priors fill in. One that leaves far more is wrong somewhere,
+and `recon.report.causes` looks for where.
 """
 
 import math
@@ -94,7 +94,7 @@ class Verdict:
             return "a method without a descent leaves that much even where all is right; 'newton' explains more"
         if self.poor:
             return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
-        free = "; Δn's sign is free: shears of the other sign may do as well with −Δn" if self.free else ""
+        free = "; Δn's sign is free: reversed shears and planes give the same images with −Δn" if self.free else ""
         if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
             return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
         if self.noise is None:
