@@ -4,7 +4,8 @@ method.
     python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
     python benchmarks/reconstruction.py ablation [NAME ...] [--cache DIR]
     python benchmarks/reconstruction.py acquisitions [cell bead] [--cache DIR]
-    python benchmarks/reconstruction.py nuisances | propagations | methods | stuck | support [--cache DIR]
+    python benchmarks/reconstruction.py nuisances | propagations | methods | stuck | support | verdicts | mistakes
+                                        [--cache DIR]
 
 "error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
 misfit over what noise alone leaves, for a clean stack the misfit itself. Seconds are processor seconds of one thread.
@@ -43,9 +44,11 @@ from recon.recording.preparation import ExpectedStack, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from recon.recording.support import edges_support
 from recon.report.metrics import volume_error
+from recon.report.verdict import Verdict, judged
 from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
+from recon.run.results import model_images
 from scenes import Scene
-from torchdic import Acquisition, Camera, Fidelity, Prism
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
 
@@ -253,6 +256,69 @@ def support(options: argparse.Namespace) -> None:
             print("| " + " | ".join((name, kind, *numbers)) + " |", flush=True)
 
 
+def verdicts(options: argparse.Namespace) -> None:
+    """What the verdict says of right fits: misfit/noise, whiteness, and whether it would warn."""
+    print("| scene | misfit/noise | whiteness | explained | verdict |\n|---|---|---|---|---|")
+    for name in options.names or list(scenes.SETUPS):
+        _, found, _ = judged_fit(scenes.scene(name, options.cache))
+        ratio = "–" if found.ratio is None else f"{found.ratio:.3f}"
+        numbers = (name, ratio, f"{found.white:.2f}", f"{found.explained:.4f}", "warned" if found.poor else "explained")
+        print("| " + " | ".join(numbers) + " |", flush=True)
+
+
+def mistakes(options: argparse.Namespace) -> None:
+    """The cell with a deliberate mistake: what the verdict says is wrong."""
+    scene = scenes.scene("cell", options.cache)
+    declared, wider = (
+        scene.acquisition,
+        replace(scene.microscope, condenser=Condenser(0.9)),
+    )
+
+    def sheared(change: Callable[[float, float], tuple[float, float]]) -> Acquisition:
+        prisms = [replace(p, shear=change(*map(float, p.shear))) for p in declared.prisms if p is not None]
+        return Acquisition(prisms, declared.focus)
+
+    swapped = Acquisition([declared.prisms[i] for i in (0, 2, 1, 3)], declared.focus)
+    hot, random = scene.data.clone(), np.random.default_rng(0)
+    rows, columns = np.divmod(random.choice(hot[0, 0].numel(), 9, replace=False), hot.shape[3])
+    hot[:, :, rows, columns] = 3 * float(scene.data.median())
+    made = {
+        "shear's sign": replace(scene, acquisition=sheared(lambda y, x: (-y, -x))),
+        "focus reversed": replace(scene, acquisition=Acquisition(declared.prisms, [-f for f in declared.focus])),
+        "axes exchanged": replace(scene, acquisition=sheared(lambda y, x: (x, y))),
+        "two prisms exchanged": replace(scene, acquisition=swapped),
+        "mirrored in y": replace(scene, data=scene.data.flip(2)),
+        "condenser 0.9 for 0.7": replace(scene, microscope=wider),
+        "wavelength 0.633 for 0.546": replace(scene, microscope=replace(scene.microscope, wavelength=0.633)),
+        "shear 1.3 times too long": replace(scene, acquisition=sheared(lambda y, x: (1.3 * y, 1.3 * x))),
+        "nine hot pixels, counted": replace(scene, data=hot),
+        "one image of another plane": replace(
+            scene, data=scene.data.index_copy(1, torch.tensor([6]), scene.data[:, 1:2])
+        ),
+    }
+    print(
+        "| mistake | error | misfit/noise | whiteness | warned | first | second | s of the search |\n"
+        + "|---" * 8
+        + "|"
+    )
+    for name in options.names or made:
+        found, verdict, seconds = judged_fit(made[name])
+        causes = [f"{cause.name} ({cause.share:.0%})" for cause in verdict.causes[:2]] + ["–", "–"]
+        numbers = (f"{found.error:.2f}", f"{verdict.ratio or math.nan:.3f}", f"{verdict.white:.2f}")
+        cells = (name, *numbers, "yes" if verdict.poor else "no", *causes[:2], f"{seconds:.0f}")
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+def judged_fit(scene: Scene) -> tuple[Found, Verdict, float]:
+    """A scene's fit, the verdict on it, and the processor seconds that the verdict took."""
+    found, noise = fit(scene), measured_noise(scene.data)
+    recipe = replace(Recipe(), bounds=Bounds(*scene.bounds))
+    problem = Problem.from_recipe(scene.data, setup_of(scene), RECOMMENDED, recipe, noise=noise)
+    began, rows = time.process_time(), [(n + 1, found.last.misfit, 0.0, 0.0) for n in range(found.last.number)]
+    verdict = judged(problem, model_images(problem, found.last), noise, "newton", rows)
+    return found, verdict, time.process_time() - began
+
+
 def propagations(options: argparse.Namespace) -> None:
     """Rays and projection alone, by both methods."""
     print(HEAD)
@@ -348,6 +414,8 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "methods": methods,
     "stuck": stuck,
     "support": support,
+    "verdicts": verdicts,
+    "mistakes": mistakes,
 }
 
 

@@ -26,7 +26,8 @@ from recon.config.reading import load
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
 from recon.report.metrics import volume_error
-from recon.run import reconstruct, recorded, results
+from recon.report.verdict import PoorFitWarning
+from recon.run import reconstruct, recorded
 from recon.run.checkpoint import CheckpointError
 from torchdic import Grid, Volume, image
 from torchdic.files.stack import read_stack, read_volume, write_stack
@@ -729,7 +730,7 @@ def test_what_needs_a_linear_transfer_is_refused_in_one_line_where_there_is_none
         assert not (tmp_path / "out").exists()
     zero = other({"microscope": microscope, "reconstruction": {"method": "adam", "start": "zero", "steps": 2}})
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", results.PoorFitWarning)  # two steps, and a stack of another microscope
+        warnings.simplefilter("ignore", PoorFitWarning)  # two steps, and a stack of another microscope
         reconstruct.reconstruct(load(zero), tmp_path / "out", torch.device("cpu"))
     assert (tmp_path / "out" / "volume.ome.tif").exists()
 
@@ -765,7 +766,7 @@ def test_rays_that_turn_are_told_in_one_line(other, tmp_path):
 
 def test_a_volume_that_explains_less_than_empty_medium_is_warned_of(other, tmp_path):
     path = other({"reconstruction": {"method": "adam", "steps": 3, "learning_rate": 0.04}})
-    with pytest.warns(results.PoorFitWarning, match="empty medium would explain the stack better"):
+    with pytest.warns(PoorFitWarning, match="empty medium would explain the stack better"):
         reconstruct.reconstruct(load(path), tmp_path / "out", torch.device("cpu"))
 
 

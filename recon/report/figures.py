@@ -2,6 +2,7 @@
 
 import io
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,6 +20,9 @@ DPI = 150
 
 # Focus planes that a picture of a whole stack shows at most.
 MOST_PLANES = 7
+
+# Mean width of a letter of 8 points.
+INCHES_PER_LETTER = 0.062
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -76,6 +80,15 @@ def draw_images(
             _scale_bar(trio[0], grid.extent[2], "white")
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
         figure.colorbar(axes[p, -1].images[0], ax=axes[p, -1], label="residual")
+    return figure
+
+
+def headed(figure: Figure, words: str) -> Figure:
+    """The figure with words above it, in as many lines as its width asks for, and as much higher as they need."""
+    width, height = figure.get_size_inches()
+    lines = textwrap.wrap(words, max(20, int(width / INCHES_PER_LETTER)))
+    figure.set_size_inches(width, height + 0.16 * len(lines))
+    figure.suptitle("\n".join(lines), fontsize=8)
     return figure
 
 

@@ -21,6 +21,7 @@ from recon.fit.unknowns import IndexDifference, with_values
 from recon.recording.preparation import Measured
 from recon.report import figures
 from recon.report.metrics import residual_rms
+from recon.report.verdict import PoorFitWarning, Verdict, judged
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
 from torchdic import Grid
 from torchdic.errors import StackError
@@ -34,10 +35,6 @@ INTERRUPTED = "volume.interrupted.ome.tif"
 
 class ResultsError(ValueError):
     """Results cannot be written: one line with the files and the reason."""
-
-
-class PoorFitWarning(UserWarning):
-    """The volume that a descent found explains its data less well than empty medium does."""
 
 
 @dataclass(frozen=True)
@@ -99,18 +96,12 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def warn_of_poor_fit(misfit: float) -> None:
-    """Warn PoorFitWarning where empty medium would explain the stack better than the volume that was found.
-
-    misfit: of that volume.
-    """
-    if misfit > 1:
-        warnings.warn(
-            f"the misfit {misfit:.3g} is above 1: empty medium would explain the stack better; "
-            "the optics in the configuration may not be those of the stack",
-            PoorFitWarning,
-            stacklevel=3,
-        )
+def tell(verdict: Verdict) -> None:
+    """Print the verdict, or warn PoorFitWarning of it where the volume doesn't explain the stack."""
+    if verdict.poor and (verdict.expected or verdict.misfit > 1):
+        warnings.warn(verdict.words, PoorFitWarning, stacklevel=3)
+    else:
+        print(verdict.words)
 
 
 def write_results(
@@ -130,7 +121,9 @@ def write_results(
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured, config.reconstruction.method)
-    warn_of_poor_fit(found["misfit"])
+    verdict = judged(problem, images, measured.noise, config.reconstruction.method, ended.rows)
+    found["verdict"] = verdict.as_json()
+    tell(verdict)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
     comments = "".join(f"# {note}\n" for note in notes)
     prisms = config.acquisition.prisms
@@ -141,7 +134,8 @@ def write_results(
             write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
 
     def draw_images() -> None:
-        figures.save(figures.draw_images(data, images.cpu(), prisms, measured.focus, grid), out / "images.png")
+        figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, grid)
+        figures.save(figures.headed(figure, verdict.words), out / "images.png")
 
     def draw_misfit() -> None:
         if ended.rows:

@@ -1,0 +1,322 @@
+"""What most likely is wrong where a volume leaves far more than noise does, by the residual and by a few short fits.
+
+A wrong sign, order or aperture leaves a residual that looks like the specimen, whatever the mistake. So the likely ones
+are tried: each is a descent of a few coarse steps beside one with what was declared. What explains the stack far better
+is named first. Other mistakes show in the residual itself: in a few pixels, at the border, in one prism, in one image.
+"""
+
+import contextlib
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.bounds import Bounds, SupportedBounds
+from recon.fit.descent import minimise
+from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.planned import GivenFidelity
+from recon.fit.problem import Problem
+from recon.fit.setup import Setup
+from recon.fit.unknowns import IndexDifference
+from recon.misfit.base import Misfit
+from torchdic import Acquisition, Fidelity, Prism
+from torchdic.errors import SamplingWarning, SidewaysError, UnstableError, WrapAroundWarning
+from torchdic.scalar import number
+
+# Steps and condenser directions of a short fit. The benchmarks' cell has a misfit of 0.17 after them if all is right,
+# and of 0.57 to 0.76 where a sign, the order of the planes or the axes are wrong.
+STEPS, SOURCES = 3, 12
+
+# A change that explains less than LEAST of what is unexplained is no cause; after one that explains ENOUGH, no more is
+# tried.
+LEAST, ENOUGH = 0.25, 0.9
+
+# The condenser's aperture is tried wider and narrower by this factor.
+APERTURE = 1.3
+
+# Two prisms exchanged are tried where there are at most so many of them.
+MOST_PRISMS = 4
+
+# Where FEW of the pixels hold more than HALF of the squared residual, and their neighbours less than ALONE of theirs,
+# the pixels are stuck.
+FEW, HALF, ALONE = 0.01, 0.5, 0.25
+
+# What is less than this part of the noise isn't seen.
+STANDS_OUT = 0.1
+
+# The frame's width over the shorter side, and how many times the squared residual within it must be that of the rest.
+FRAME, BORDER = 1 / 10, 3.0
+
+# The squared residual of one prism over the least one's, and of one image over the images' median, that stand out.
+PRISM, IMAGE = 3.0, 6.0
+
+
+PRIORS = "priors"
+
+
+@dataclass(frozen=True)
+class Cause:
+    """What may be wrong.
+
+    name: in one or two words. share: of what is unexplained, that this would explain; causes are ranked by it.
+    reason: what speaks for it. advice: what to do.
+    """
+
+    name: str
+    share: float
+    reason: str
+    advice: str
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A problem as it would be had something been declared otherwise. what: the mistake, in words."""
+
+    name: str
+    what: str
+    advice: str
+    problem: Problem
+
+
+def ranked(causes: Sequence[Cause]) -> tuple[Cause, ...]:
+    """The likeliest cause first."""
+    return tuple(sorted(causes, key=lambda cause: -cause.share))
+
+
+# --- what the residual shows ------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def seen_in_residual(
+    images: Float[Tensor, "prism focus y x"], misfit: Misfit, noise: float, margin: int
+) -> Iterator[Cause]:
+    """The causes that the residual shows by where it is.
+
+    images: the model's. noise: what noise leaves of the misfit. margin: voxels of the volume beyond the field.
+    """
+    residual = misfit.where_counted(images - misfit.data) / misfit.variance.sqrt()
+    squares = residual.square()
+    excess = max(float(squares.mean()) - noise, STANDS_OUT * noise, 1e-12)
+    yield from _stuck(squares.mean((0, 1)))
+    level = float(residual.mean((2, 3)).square().mean())
+    if level > HALF * excess:
+        yield Cause(
+            "brightness",
+            min(1.0, level / excess),
+            "the residual is uniform within each image",
+            "fit the brightness (method 'newton' or 'adam'), or flatten the stack (data.flatten = true)",
+        )
+    if margin == 0:
+        yield from _cut(squares.mean((0, 1)), noise)
+    yield from _uneven(squares.mean((2, 3)), noise)
+
+
+def _stuck(power: Float[Tensor, "y x"]) -> Iterator[Cause]:
+    """Pixels that leave most of the residual in all images, each by itself."""
+    number_of = max(1, round(FEW * power.numel()))
+    top = power.flatten().topk(number_of)
+    share = float(top.values.sum() / power.sum())
+    padded = torch.nn.functional.pad(power[None, None], (1, 1, 1, 1), mode="replicate")
+    around = torch.nn.functional.unfold(padded, 3)[0].reshape(9, -1)
+    beside = torch.cat([around[:4], around[5:]]).median(0).values[top.indices]
+    alone = float((top.values * (beside < ALONE * top.values)).sum() / power.sum())
+    if alone > HALF:
+        yield Cause(
+            "stuck pixels",
+            share,
+            f"{number_of} of {power.numel()} pixels hold {share:.0%} of the residual, each by itself",
+            "leave them out: data.stuck = 'auto', or data.mask",
+        )
+
+
+def _cut(power: Float[Tensor, "y x"], noise: float) -> Iterator[Cause]:
+    """A specimen that goes on beyond the field."""
+    width = max(1, round(FRAME * min(power.shape)))
+    within = power[width:-width, width:-width]
+    if within.numel() == 0:
+        return
+    total = float((power - noise).sum())
+    frame = total - float((within - noise).sum())
+    ratio = frame / (power.numel() - within.numel()) / max(float((within - noise).mean()), STANDS_OUT * noise, 1e-12)
+    if ratio > BORDER and total > 0:
+        yield Cause(
+            "cut specimen",
+            min(1.0, frame / total),
+            f"the residual at the images' border is {ratio:.1f} times that within",
+            "widen the volume beyond the field: reconstruction.margin",
+        )
+
+
+def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause]:
+    """A prism or an image that isn't explained where the others are."""
+    prisms = power.mean(1)
+    worst, least = int(prisms.argmax()), float(prisms.min())
+    total = max(float((prisms - noise).sum()), 1e-12)
+    if len(prisms) > 1 and float(prisms[worst]) > PRISM * max(least, noise):
+        yield Cause(
+            f"prism {worst}",
+            min(1.0, float(prisms[worst] - noise) / total) / 2,
+            f"its residual is {float(prisms[worst]) / max(least, 1e-12):.1f} times that of the best prism",
+            f"check shear, bias and files of prism {worst} (counted from 0), or fit it (learn = ['bias'])",
+        )
+    median = float(power.median())
+    p, f = divmod(int(power.argmax()), power.shape[1])
+    if power.numel() > 2 and float(power[p, f]) > IMAGE * max(median, noise):
+        yield Cause(
+            "one image",
+            min(1.0, float(power[p, f] - noise) / max(float((power - noise).sum()), 1e-12)),
+            f"prism {p}, plane {f} leaves {float(power[p, f]) / max(median, 1e-12):.1f} times the median image's",
+            "look at that image (moved, blurred, in the wrong place?) and mask it or leave it out",
+        )
+
+
+# --- what short fits show ---------------------------------------------------------------------------------------------
+
+
+def can_be_tried(problem: Problem) -> bool:
+    """Whether short fits can be made: Newton's steps need a condenser prism and images linear in a weak specimen."""
+    microscope, acquisition = problem.setup.microscope, problem.setup.acquisition
+    sheared = any(prism is not None for prism in acquisition.prisms)
+    if microscope.lenses is not None or (sheared and not microscope.condenser_prism):
+        return False
+    return responds_linearly(microscope, acquisition)
+
+
+def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
+    """The causes that explain the stack better in a short fit than what was declared does.
+
+    misfit: of the finished volume. noise: what noise leaves of it. A fit whose light can't be followed explains
+    nothing. Without priors any fit comes closer, so that one must come closer than the finished one.
+    """
+    declared = short_fit(problem)
+    for variant in variants(problem):
+        found = short_fit(variant.problem)
+        usual = misfit if variant.name == PRIORS else declared
+        share = min(1.0, (usual - found) / max(usual - noise, 1e-12))
+        if share < LEAST:
+            continue
+        reason = f"a short fit so has a misfit of {found:.3g}, as declared {usual:.3g}"
+        yield Cause(variant.name, share, f"{variant.what}: {reason}", variant.advice)
+        if share > ENOUGH:
+            return
+
+
+def short_fit(problem: Problem) -> float:
+    """The misfit after a few coarse steps of Newton's; infinite where the light can't be followed."""
+    coarse = GivenFidelity(Fidelity("wave", sources=SOURCES), None)
+    least = math.inf
+    with warnings.catch_warnings(), contextlib.suppress(FloatingPointError, UnstableError, SidewaysError):
+        # what is warned of for a trial's aperture says nothing of the user's
+        for kind in (SamplingWarning, WrapAroundWarning):
+            warnings.simplefilter("ignore", kind)
+        for step in minimise(replace(problem, fidelity=coarse, steps=STEPS, method="newton")):
+            least = min(least, step.misfit)
+    return least
+
+
+def variants(problem: Problem) -> Iterator[Variant]:
+    """The problem with each likely mistake undone, the likeliest first; those that change nothing are left out."""
+    setup = problem.setup
+    lower = _of_the_other_sign(problem)
+    if lower is not None:
+        advice = (
+            "let the bounds of Δn hold the other sign; or reverse every shear and acquisition.focus, which to first "
+            "order gives the same images"
+        )
+        yield Variant("Δn's sign", "Δn is on the other side of 0", advice, lower)
+    seen = [_images_of(setup.acquisition)]
+    for name, what, advice, acquisition in _acquisitions(setup.acquisition):
+        made = _images_of(acquisition)
+        if made not in seen:
+            seen.append(made)
+            yield Variant(name, what, advice, replace(problem, setup=replace(setup, acquisition=acquisition)))
+    for na, changed in _apertures(setup):
+        advice = f"check the condenser's aperture diaphragm and immersion (na {na:.2g} explains more)"
+        yield Variant("condenser", f"the condenser's na is nearer to {na:.2g}", advice, replace(problem, setup=changed))
+    if problem.priors and problem.weight is None:  # a weight that follows the noise isn't too strong
+        advice = "lower reconstruction.tv and l1, or leave tv = 'auto'"
+        yield Variant(PRIORS, "the priors are too strong", advice, replace(problem, priors=(), weight=None))
+
+
+def _acquisitions(declared: Acquisition) -> Iterator[tuple[str, str, str, Acquisition]]:
+    """What may have been recorded instead of what was declared."""
+
+    def sheared(y: int, x: int, exchanged: bool = False) -> Acquisition:
+        return Acquisition([_sheared(p, y, x, exchanged) for p in declared.prisms], declared.focus)
+
+    back = Acquisition(declared.prisms, [-number(f) for f in declared.focus])
+    yield (
+        "sign",
+        "the shear or the bias has the other sign",
+        "reverse the sign of every shear, or exchange the files of bias +b and −b",
+        sheared(-1, -1),
+    )
+    yield "focus", "the planes are in the other order", "reverse acquisition.focus: the stage's +z is −z", back
+    advice = "exchange y and x of every shear: [y, x]; or the prisms' files; or the images are transposed"
+    yield "axes", "the shears' axes are exchanged", advice, sheared(1, 1, exchanged=True)
+    for axis, signs in (("y", (-1, 1)), ("x", (1, -1))):
+        advice = f"reverse the sign of the shears' {axis}, or mirror the images in {axis}"
+        yield f"mirrored {axis}", f"the images are mirrored in {axis}", advice, sheared(*signs)
+    both = Acquisition(sheared(-1, -1).prisms, back.focus)
+    yield "sign and focus", "signs and planes are both reversed", "reverse every shear, and acquisition.focus", both
+    advice = "exchange y and x of every shear and reverse their signs; or turn the images"
+    yield "axes and sign", "the shears' axes are exchanged and reversed", advice, sheared(-1, -1, exchanged=True)
+    if len(declared.prisms) <= MOST_PRISMS:
+        for i, j in combinations(range(len(declared.prisms)), 2):
+            prisms = list(declared.prisms)
+            prisms[i], prisms[j] = prisms[j], prisms[i]
+            what, advice = f"prisms {i} and {j} (from 0) are exchanged", "exchange them in acquisition.prisms"
+            yield "prisms", what, advice, Acquisition(prisms, declared.focus)
+
+
+def _sheared(prism: Prism | None, y: int, x: int, exchanged: bool) -> Prism | None:
+    if prism is None:
+        return None
+    shear = (number(prism.shear[0]), number(prism.shear[1]))
+    first, second = shear[::-1] if exchanged else shear
+    return replace(prism, shear=(y * first, x * second))
+
+
+def _images_of(acquisition: Acquisition) -> tuple[object, ...]:
+    """What tells acquisitions apart. A prism of the other shear and bias is the same one, with its beams renamed."""
+    prisms = []
+    for prism in acquisition.prisms:
+        sign = 1 if prism is None or number(prism.bias) >= 0 else -1
+        values = () if prism is None else (*map(number, prism.shear), number(prism.bias))
+        prisms.append(tuple(sign * value + 0.0 for value in values))
+    return tuple(prisms), tuple(number(focus) for focus in acquisition.focus)
+
+
+def _of_the_other_sign(problem: Problem) -> Problem | None:
+    """The problem with Δn on the other side of 0; None where its bounds don't end there, or a support has its own."""
+    index = next(unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference))
+    bounds = index.bounds
+    if (
+        isinstance(bounds, SupportedBounds)
+        or (bounds.lower is None) == (bounds.upper is None)
+        or 0
+        not in (
+            bounds.lower,
+            bounds.upper,
+        )
+    ):
+        return None
+    mirrored = Bounds(*(None if bound is None else -bound + 0.0 for bound in (bounds.upper, bounds.lower)))
+    changed = [replace(index, bounds=mirrored) if unknown is index else unknown for unknown in problem.unknowns]
+    return replace(problem, unknowns=changed)
+
+
+def _apertures(setup: Setup) -> Iterator[tuple[float, Setup]]:
+    """The setup with a wider and with a narrower condenser, within what the medium lets pass."""
+    condenser = setup.microscope.condenser
+    if condenser is None or number(condenser.na) <= 0 or condenser.points is not None or condenser.inner_na is not None:
+        return
+    for factor in (APERTURE, 1 / APERTURE):
+        na = number(condenser.na) * factor
+        if na < number(setup.volume.background):
+            yield na, replace(setup, microscope=replace(setup.microscope, condenser=replace(condenser, na=na)))

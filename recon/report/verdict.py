@@ -1,0 +1,194 @@
+"""Whether a volume explains its stack: the misfit over what noise leaves, what the residual looks like, and what to do.
+
+Noise alone leaves a known part of the misfit. A volume that leaves as much explains the stack, which doesn't say that
+it is right everywhere: what the apertures don't see, the priors fill in. One that leaves far more is wrong somewhere,
+and `recon.report.causes` looks for where.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.bounds import Bounds
+from recon.fit.problem import DIRECT, Problem
+from recon.fit.step import Row
+from recon.fit.unknowns import IndexDifference
+from recon.prior.weight import FALLING, whiteness
+from recon.report.causes import Cause, can_be_tried, ranked, seen_in_residual, tried
+
+# Misfit over noise's above which a volume doesn't explain its stack, if LEAST of the specimen's contrast is unexplained
+# as well: without noise, voxels and directions leave some 0.05 %. Right fits of the benchmarks end at 0.99 to 1.05.
+LIMIT, LEAST = 1.1, 0.01
+
+# Below it the volume has followed the noise.
+FOLLOWS = 0.9
+
+# A residual whose high frequencies are by more than this part weaker or stronger than all has structure.
+WHITE = 0.1
+
+# A descent of fewer steps hasn't come far enough for its misfit to tell anything but that.
+FEW_STEPS = 8
+
+
+class PoorFitWarning(UserWarning):
+    """The volume that was found doesn't explain the data within their noise."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a finished fit's misfit and residual say.
+
+    misfit, noise: of the volume, and what noise leaves; None where that isn't known. white: see
+    `recon.prior.weight.whiteness`; 1 is white. causes: what may be wrong, the likeliest first; empty where the volume
+    explains the stack. free: whether the bounds leave the sign of Δn free. expected: whether the method's images are
+    expected to come down to the noise.
+    """
+
+    misfit: float
+    noise: float | None
+    white: float
+    causes: tuple[Cause, ...] = ()
+    free: bool = False
+    expected: bool = True
+
+    @property
+    def ratio(self) -> float | None:
+        """The misfit over the noise's; None where that isn't known or 0."""
+        return self.misfit / self.noise if self.noise else None
+
+    @property
+    def explained(self) -> float:
+        """The share of the specimen's contrast, without the noise, that the volume explains."""
+        return 1 - _unexplained(self.misfit, self.noise)
+
+    @property
+    def poor(self) -> bool:
+        """Whether the volume leaves more than noise and the model do, or more than an empty medium."""
+        return leaves_too_much(self.misfit, self.noise)
+
+    @property
+    def words(self) -> str:
+        """The verdict in one line."""
+        return f"{self.measured}: {self._judgement()}"
+
+    @property
+    def measured(self) -> str:
+        """The misfit beside the noise's, in words."""
+        if self.noise is None:
+            return f"misfit {self.misfit:.3g} (1 is an empty volume's; how much noise leaves isn't known)"
+        if self.noise < LEAST / 100:
+            return f"misfit {self.misfit:.3g} (1 is an empty volume's; there is next to no noise)"
+        return f"misfit {self.misfit:.3g} is {self.misfit / self.noise:.3f} × what noise leaves ({self.noise:.3g})"
+
+    def _judgement(self) -> str:
+        residual = "white" if abs(self.white - 1) < WHITE else f"structured (whiteness {self.white:.2g})"
+        if self.misfit > 1:
+            empty = "empty medium would explain the stack better; the optics may not be those of the stack"
+            return f"{empty}; {self._likeliest()}" if self.causes else empty
+        if self.poor and not self.expected:
+            return "a method without a descent leaves that much even where all is right; 'newton' explains more"
+        if self.poor:
+            return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
+        free = "; Δn's sign is free: reversed shears and planes give the same images with −Δn" if self.free else ""
+        if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
+            return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
+        if self.noise is None:
+            return f"it explains {self.explained:.1%} of the contrast, residual {residual}{free}"
+        return f"the volume explains the stack{free}"
+
+    def _likeliest(self) -> str:
+        if not self.causes:
+            return (
+                "no single cause was found: check pixel size, focus step, wavelength, apertures, shear and bias, "
+                "and try learn = ['bias', 'drift']"
+            )
+        first, *others = self.causes
+        named = f"; or {', '.join(dict.fromkeys(cause.name for cause in others[:2]))}" if others else ""
+        return f"most likely: {first.name} ({first.reason}): {first.advice}{named}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The verdict as metrics.json holds it."""
+        return {
+            "ratio": self.ratio,
+            "white": self.white,
+            "explained": self.explained,
+            "poor": self.poor,
+            "causes": [asdict(cause) for cause in self.causes],
+            "words": self.words,
+        }
+
+
+def leaves_too_much(misfit: float, noise: float | None) -> bool:
+    """Whether a misfit is above what noise leaves and a right model may add. noise: None where it isn't known."""
+    if misfit > 1 or not math.isfinite(misfit):
+        return True
+    return noise is not None and misfit > LIMIT * noise and _unexplained(misfit, noise) > LEAST
+
+
+def _unexplained(misfit: float, noise: float | None) -> float:
+    """The part of the specimen's contrast that a volume leaves. noise: None counts as none."""
+    alone = min(noise or 0.0, 1 - 1e-6)
+    return max(0.0, (misfit - alone) / (1 - alone))
+
+
+@torch.no_grad()
+def judged(
+    problem: Problem,
+    images: Float[Tensor, "prism focus y x"],
+    noise: Sequence[float] | None,
+    method: str,
+    rows: Sequence[Row],
+) -> Verdict:
+    """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
+
+    images: the model's, of the last step. noise: standard deviation of each prism's, None where it isn't known.
+    method: that found the volume. rows: of the log.
+    """
+    misfit = float(problem.misfit(images))
+    alone = problem.misfit.of_noise(noise) if noise is not None or problem.misfit.knows_all else None
+    index = next((unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference)), None)
+    free = index is not None and _free(index.bounds)
+    white = whiteness(images, problem.misfit)
+    found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT)
+    if not found.poor or not found.expected:
+        return found
+    return Verdict(misfit, alone, white, _causes(problem, images, alone or 0.0, rows), free)
+
+
+def _causes(problem: Problem, images: Tensor, noise: float, rows: Sequence[Row]) -> tuple[Cause, ...]:
+    """What may be wrong with a poor fit, the likeliest first."""
+    causes = list(_unfinished(rows))
+    if len(rows) >= FEW_STEPS or not rows:
+        causes += seen_in_residual(images, problem.misfit, noise, problem.setup.margin)
+        if can_be_tried(problem):
+            print("the misfit is far above the noise's: short fits of what may have been declared wrongly …")
+            misfit = float(problem.misfit(images))
+            try:
+                with torch.enable_grad():
+                    for cause in tried(problem, misfit, noise):
+                        causes.append(cause)
+            except KeyboardInterrupt:  # the volume is found and is still to be written
+                print("the search for causes was interrupted")
+    return ranked(causes)
+
+
+def _unfinished(rows: Sequence[Row]) -> list[Cause]:
+    """A descent that hadn't come to its end."""
+    if 0 < len(rows) < FEW_STEPS:
+        return [Cause("few steps", 1.0, f"{len(rows)} steps are few", "let it take more: reconstruction.steps")]
+    if len(rows) > 1:
+        before, last = rows[-2][1], rows[-1][1]
+        if last < (1 - FALLING) * before:
+            reason = f"the last step lowered the misfit by {1 - last / before:.0%}"
+            return [Cause("few steps", 0.3, reason, "let it take more: reconstruction.steps")]
+    return []
+
+
+def _free(bounds: Bounds) -> bool:
+    """Whether Δn may be of either sign."""
+    return (bounds.lower is None or bounds.lower < 0) and (bounds.upper is None or bounds.upper > 0)

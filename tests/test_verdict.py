@@ -1,0 +1,195 @@
+"""The verdict on a finished fit, and what most likely is wrong with a poor one."""
+
+import math
+import warnings
+
+import pytest
+import torch
+
+from recon.fit.bounds import Bounds
+from recon.fit.problem import Problem, Recipe
+from recon.fit.setup import Setup, empty_medium
+from recon.misfit.gaussian import GaussianMisfit
+from recon.report.causes import can_be_tried, seen_in_residual, tried, variants
+from recon.report.verdict import LIMIT, PoorFitWarning, Verdict, judged, leaves_too_much
+from recon.run.results import tell
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+
+GRID = Grid((6, 24, 22), (0.5, 0.2, 0.2))
+MICROSCOPE = Microscope(0.546, Objective(0.7), Condenser(0.5))
+SHEARS, FOCUS = ((0.0, 0.24), (0.24, 0.0)), (-1.5, -0.5, 0.5, 1.5)
+QUARTER = math.pi / 2
+TRUE = Acquisition([Prism(shear, QUARTER) for shear in SHEARS], FOCUS)
+NOISE = 0.004
+pytestmark = pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
+
+
+def sheared(*shears, focus=FOCUS):
+    return Acquisition([Prism(shear, QUARTER) for shear in shears], focus)
+
+
+MISTAKES = {
+    "sign": sheared((0.0, -0.24), (-0.24, 0.0)),
+    "focus": sheared(*SHEARS, focus=FOCUS[::-1]),
+    "axes": sheared(*SHEARS[::-1]),
+    "mirrored y": sheared((0.0, 0.24), (-0.24, 0.0)),
+    "mirrored x": sheared((0.0, -0.24), (0.24, 0.0)),
+}
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """A ball off the centre, so that no mirror image of it is the same."""
+    z, y, x = ((torch.arange(n) - (n - 1) / 2) * d for n, d in zip(GRID.shape, GRID.spacing, strict=True))
+    distance = ((z[:, None, None] - 0.5) ** 2 + (y[:, None] + 0.4) ** 2 + (x - 0.5) ** 2).sqrt()
+    return 0.02 * torch.sigmoid((0.9 - distance) / 0.1)
+
+
+@pytest.fixture(scope="module")
+def images(truth):
+    with torch.no_grad():
+        return image(Volume(GRID, truth, 1.335), MICROSCOPE, TRUE, Fidelity(sources=18))
+
+
+@pytest.fixture(scope="module")
+def data(images):
+    return images + NOISE * torch.randn(images.shape, generator=torch.Generator().manual_seed(0))
+
+
+def problem_of(data, acquisition=TRUE, bounds=None, **parts):
+    setup = Setup(empty_medium(GRID, 1.335, data), parts.get("microscope", MICROSCOPE), acquisition)
+    return Problem.from_recipe(data, setup, Fidelity(sources=18), Recipe(bounds=bounds or Bounds()), noise=[NOISE] * 2)
+
+
+# causes that short fits find
+
+
+@pytest.mark.parametrize(
+    "name", ["sign", "focus", *(pytest.param(n, marks=pytest.mark.slow) for n in ("axes", "mirrored y", "mirrored x"))]
+)
+def test_a_short_fit_names_the_mistake_of_geometry(data, name):
+    problem = problem_of(data, MISTAKES[name])
+    first = max(tried(problem, 0.9, problem.misfit.of_noise([NOISE] * 2)), key=lambda cause: cause.share)
+    assert first.name == name
+    assert first.share > 0.7
+
+
+def test_a_specimen_on_the_other_side_of_the_bounds_is_found(data):
+    problem = problem_of(data, bounds=Bounds(None, 0.0))
+    causes = sorted(tried(problem, 0.9, problem.misfit.of_noise([NOISE] * 2)), key=lambda cause: -cause.share)
+    assert causes[0].name == "Δn's sign"
+
+
+@pytest.mark.slow
+def test_a_right_problem_has_no_other_that_explains_as_much(data):
+    problem = problem_of(data)
+    noise = problem.misfit.of_noise([NOISE] * 2)
+    assert not list(tried(problem, LIMIT * noise, noise))
+
+
+def test_a_variant_differs_from_all_others(data):
+    """A prism of reversed shear and bias is the same prism, so nothing is tried twice."""
+    both = Acquisition([Prism((0.0, 0.24), QUARTER), Prism((0.0, 0.24), -QUARTER)], FOCUS)
+    names = [v.name for v in variants(problem_of(data, both))]
+    assert names.count("sign") == 1
+    assert "prisms" not in names  # to exchange these two is to reverse the sign
+    assert "mirrored x" not in names
+    assert "mirrored y" not in names
+
+
+def test_what_newton_cannot_fit_is_not_tried(data):
+    assert can_be_tried(problem_of(data))
+    assert not can_be_tried(problem_of(data, microscope=Microscope(0.546, condenser_prism=False)))
+
+
+# causes that the residual shows
+
+
+def residual_causes(images, data, margin=0):
+    misfit = GaussianMisfit(data)
+    return {cause.name for cause in seen_in_residual(images, misfit, misfit.of_noise([NOISE] * 2), margin)}
+
+
+def test_noise_alone_shows_no_cause(images, data):
+    assert residual_causes(images, data) == set()
+
+
+def test_each_spoilt_residual_shows_its_cause(images, data):
+    stuck, cut, moved, lit = (data.clone() for _ in range(4))
+    stuck[:, :, [3, 20], [5, 9]] += 1.0
+    cut[..., :2] += 0.2 * torch.sin(torch.arange(24.0))[:, None]
+    moved[1, 2] = moved[1, 2].roll(7, 0)
+    lit += 0.1 * torch.randn(2, 4, 1, 1, generator=torch.Generator().manual_seed(1))
+    assert "stuck pixels" in residual_causes(images, stuck)
+    assert "cut specimen" in residual_causes(images, cut)
+    assert "cut specimen" not in residual_causes(images, cut, margin=3)
+    assert "one image" in residual_causes(images, moved)
+    assert "brightness" in residual_causes(images, lit)
+
+
+# the verdict
+
+
+def test_the_truth_explains_its_stack(images, data):
+    found = judged(problem_of(data), images, [NOISE] * 2, "newton", [(n, 0.5, 0.5, 1.0) for n in range(20)])
+    assert not found.poor
+    assert found.causes == ()
+    assert found.ratio == pytest.approx(1.0, abs=0.05)
+    assert found.explained == pytest.approx(1.0, abs=0.05)
+    assert found.white == pytest.approx(1.0, abs=0.1)
+    assert "the volume explains the stack" in found.words
+    assert "×" in found.words
+
+
+def test_few_steps_are_named_and_nothing_else_is_tried(data, capsys):
+    empty = data.mean((2, 3), keepdim=True).expand(data.shape)
+    found = judged(problem_of(data), empty, [NOISE] * 2, "newton", [(1, 1.0, 1.0, 1.0)])
+    assert found.poor
+    assert [cause.name for cause in found.causes] == ["few steps"]
+    assert capsys.readouterr().out == ""
+
+
+def test_a_poor_fit_is_warned_of_with_cause_and_advice(data, capsys):
+    empty = data.mean((2, 3), keepdim=True).expand(data.shape)
+    rows = [(n, 0.9, 0.9, 1.0) for n in range(20)]
+    found = judged(problem_of(data, MISTAKES["sign"]), empty, [NOISE] * 2, "newton", rows)
+    assert "short fits" in capsys.readouterr().out
+    with pytest.warns(PoorFitWarning, match=r"most likely: sign .*reverse the sign of every shear"):
+        tell(found)
+    assert found.as_json()["causes"][0]["name"] == "sign"
+    assert "\n" not in found.words
+
+
+def test_a_good_fit_is_told_without_a_warning(capsys):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tell(Verdict(0.131, 0.1305, 1.0))
+    assert (
+        capsys.readouterr().out == "misfit 0.131 is 1.004 × what noise leaves (0.131): the volume explains the stack\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("misfit", "noise", "poor"),
+    [
+        (0.0005, 0.0, False),  # clean: what voxels and directions leave
+        (0.3, 0.0, True),
+        (0.0153, 0.0146, False),
+        (0.136, 0.129, False),
+        (0.15, 0.129, True),
+        (0.99, 0.98, False),
+        (1.01, None, True),
+        (0.5, None, False),
+        (math.nan, 0.1, True),
+    ],
+)
+def test_too_much_is_a_tenth_above_the_noise_and_a_hundredth_of_the_contrast(misfit, noise, poor):
+    assert leaves_too_much(misfit, noise) is poor
+
+
+def test_a_volume_that_follows_the_noise_is_told():
+    assert "follows the noise" in Verdict(0.1, 0.13, 1.0).words
+
+
+def test_free_bounds_are_told():
+    assert "Δn's sign is free" in Verdict(0.13, 0.13, 1.0, free=True).words
