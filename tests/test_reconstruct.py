@@ -602,6 +602,7 @@ def test_resume_without_an_interrupted_run_begins_one(other, tmp_path):
     assert len(rows(tmp_path / "out")) == 2
 
 
+@pytest.mark.filterwarnings("ignore::recon.report.verdict.PoorFitWarning")  # twelve steps of Adam
 @pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
 def test_a_run_may_be_interrupted_again_and_again(other, interrupt, tmp_path, method):
     path, out = other({"reconstruction": {"method": method, "steps": 12}}), tmp_path / "out"

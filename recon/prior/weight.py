@@ -37,7 +37,8 @@ FALLING = 0.03
 
 # Where the misfit is more than BEYOND times its aim, and the last lower weight has LEFT more than this share of what
 # lies above the aim, not the priors hold the misfit up but the model: other optics, or light that it can't follow.
-BEYOND, LEFT = 1.2, 0.75
+# Above SEEN the priors may still hide the specimen altogether.
+BEYOND, LEFT, SEEN = 1.2, 0.75, 0.25
 
 # Frequencies above this many cycles per pixel, along y or x, are high.
 HIGH = 0.35
@@ -95,7 +96,7 @@ class FollowsNoise:
         aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"
-        if misfit > BEYOND * aim and (held := _in_vain(past, misfit, aim)) is not None:
+        if BEYOND * aim < misfit < SEEN and (held := _in_vain(past, misfit, aim)) is not None:
             return held, "the model holds the misfit up"
         longest = reach(weights)
         factor = math.exp(min(max(GAIN * math.log(aim / misfit), -longest), longest))

@@ -388,7 +388,7 @@ class _Descent:
         pairs, rise = self.remembered(place, now, there, step), there.misfit - now.misfit + penalties
         if rise > CREEP * objective:
             return self.taken_back(place), now
-        factor = SHORTER if share < POOR or rise > 0 else LONGER if share > GOOD else 1.0
+        factor = LONGER if share > GOOD else SHORTER if share < POOR else 1.0
         return replace(onward, damping=max(factor * place.damping, LEAST), pairs=pairs), there
 
     def remembered(self, place: Place, now: Judged, there: Judged, step: Tensor) -> tuple[Pair, ...]:
