@@ -210,14 +210,19 @@ def nuisances(options: argparse.Namespace) -> None:
             print(f"  |bias| off by {', '.join(f'{math.degrees(o):+.2f}°' for o in off)}")
 
 
+def with_stuck_pixels(data: Tensor, hot: int, dead: int = 0) -> Tensor:
+    """A stack in which some pixels of the camera, drawn from a fixed seed, hold three times the median, others 0."""
+    spoiled, (ny, nx) = data.clone(), data.shape[2:]
+    rows, columns = np.divmod(np.random.default_rng(0).choice(ny * nx, hot + dead, replace=False), nx)
+    spoiled[:, :, rows[:hot], columns[:hot]] = 3 * float(data.median())
+    spoiled[:, :, rows[hot:], columns[hot:]] = 0.0
+    return spoiled
+
+
 def stuck(options: argparse.Namespace) -> None:
     """The cell on a camera of which 9 pixels are hot and 5 dead: left out as the command does, and counted."""
     scene = scenes.scene("cell", options.cache)
-    random = np.random.default_rng(0)
-    spoiled, (ny, nx) = scene.data.clone(), scene.grid.shape[1:]
-    rows, columns = np.divmod(random.choice(ny * nx, 14, replace=False), nx)
-    spoiled[:, :, rows[:9], columns[:9]] = 3 * float(scene.data.median())
-    spoiled[:, :, rows[9:], columns[9:]] = 0.0
+    spoiled = with_stuck_pixels(scene.data, hot=9, dead=5)
     print(HEAD)
     print(row("clean", fit(scene)), flush=True)
     stack = Stack(spoiled.numpy())
@@ -269,19 +274,13 @@ def verdicts(options: argparse.Namespace) -> None:
 def mistakes(options: argparse.Namespace) -> None:
     """The cell with a deliberate mistake: what the verdict says is wrong."""
     scene = scenes.scene("cell", options.cache)
-    declared, wider = (
-        scene.acquisition,
-        replace(scene.microscope, condenser=Condenser(0.9)),
-    )
+    declared, wider = scene.acquisition, replace(scene.microscope, condenser=Condenser(0.9))
 
     def sheared(change: Callable[[float, float], tuple[float, float]]) -> Acquisition:
         prisms = [replace(p, shear=change(*map(float, p.shear))) for p in declared.prisms if p is not None]
         return Acquisition(prisms, declared.focus)
 
     swapped = Acquisition([declared.prisms[i] for i in (0, 2, 1, 3)], declared.focus)
-    hot, random = scene.data.clone(), np.random.default_rng(0)
-    rows, columns = np.divmod(random.choice(hot[0, 0].numel(), 9, replace=False), hot.shape[3])
-    hot[:, :, rows, columns] = 3 * float(scene.data.median())
     made = {
         "shear's sign": replace(scene, acquisition=sheared(lambda y, x: (-y, -x))),
         "focus reversed": replace(scene, acquisition=Acquisition(declared.prisms, [-f for f in declared.focus])),
@@ -291,7 +290,7 @@ def mistakes(options: argparse.Namespace) -> None:
         "condenser 0.9 for 0.7": replace(scene, microscope=wider),
         "wavelength 0.633 for 0.546": replace(scene, microscope=replace(scene.microscope, wavelength=0.633)),
         "shear 1.3 times too long": replace(scene, acquisition=sheared(lambda y, x: (1.3 * y, 1.3 * x))),
-        "nine hot pixels, counted": replace(scene, data=hot),
+        "nine hot pixels, counted": replace(scene, data=with_stuck_pixels(scene.data, hot=9)),
         "one image of another plane": replace(
             scene, data=scene.data.index_copy(1, torch.tensor([6]), scene.data[:, 1:2])
         ),
@@ -311,9 +310,9 @@ def mistakes(options: argparse.Namespace) -> None:
 
 def judged_fit(scene: Scene) -> tuple[Found, Verdict, float]:
     """A scene's fit, the verdict on it, and the processor seconds that the verdict took."""
-    found, noise = fit(scene), measured_noise(scene.data)
-    recipe = replace(Recipe(), bounds=Bounds(*scene.bounds))
-    problem = Problem.from_recipe(scene.data, setup_of(scene), RECOMMENDED, recipe, noise=noise)
+    setup, noise = setup_of(scene), measured_noise(scene.data)
+    found, recipe = fit(scene, setup=setup), replace(Recipe(), bounds=Bounds(*scene.bounds))
+    problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, noise=noise)
     began, rows = time.process_time(), [(n + 1, found.last.misfit, 0.0, 0.0) for n in range(found.last.number)]
     verdict = judged(problem, model_images(problem, found.last), noise, "newton", rows)
     return found, verdict, time.process_time() - began

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import tomli_w
 import torch
+from refusal import the_error
 
-from recon.config import Config, ConfigError, UnitsWarning, dump, flat, load
+from recon.config import Config, UnitsWarning, dump, flat, load
 from recon.config.schema import VolumeSection
 from recon.fit.bounds import Bounds
 from recon.fit.problem import Recipe
@@ -88,16 +89,6 @@ def changed(key, value):
     else:
         place[last] = value
     return tomli_w.dumps(values)
-
-
-def the_error(path):
-    """The one line with which a file is refused; it begins with the file."""
-    with pytest.raises(ConfigError) as caught:
-        load(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    return message.removeprefix(f"{path}: ")
 
 
 def equal(a, b):

@@ -4,8 +4,9 @@ import tomllib
 
 import pytest
 import tomli_w
+from refusal import the_error
 
-from recon.config import ConfigError, load
+from recon.config import load
 from recon.config.units import wrong_unit
 
 TEXT = """
@@ -42,15 +43,6 @@ def put(tmp_path):
         return path
 
     return write
-
-
-def the_error(path):
-    with pytest.raises(ConfigError) as caught:
-        load(path)
-    message = str(caught.value)
-    assert message.startswith(f"{path}: ")
-    assert "\n" not in message
-    return message.removeprefix(f"{path}: ")
 
 
 # --- encodings --------------------------------------------------------------------------------------------------------

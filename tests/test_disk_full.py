@@ -11,6 +11,7 @@ import tifffile
 import tomli_w
 import torch
 from matplotlib.figure import Figure
+from results import RESULTS
 
 from recon.cli import main
 from recon.fit.step import Step
@@ -80,17 +81,6 @@ def run(tmp_path, capsys, no_pictures):
         return code, told, {path.name for path in (tmp_path / "out").iterdir()}
 
     return call
-
-
-RESULTS = {
-    "volume.ome.tif",
-    "metrics.json",
-    "log.csv",
-    "config.resolved.toml",
-    "images.png",
-    "sections.png",
-    "misfit.png",
-}
 
 
 def test_a_checkpoint_without_room_is_told_and_the_run_goes_on(run, full):

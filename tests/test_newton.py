@@ -279,7 +279,7 @@ def test_one_slice_is_found():
 
 @pytest.mark.parametrize("propagation", ["projection", pytest.param("rays", marks=SLOW)])
 def test_other_propagations_lower_their_misfit(propagation):
-    """The Hessian is the wave's, which the secants and the damping make up for."""
+    """The Hessian is that of straight rays, and the secants and the damping make up for the rest."""
     fidelity = Fidelity(propagation, sources=4)
     setup = setup_of(bead())
     data, _ = recorded(setup, 0.2, fidelity)

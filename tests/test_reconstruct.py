@@ -19,6 +19,7 @@ import tomli_w
 import torch
 from absolute import Absolute
 from matplotlib import image as pictures
+from results import RESULTS
 
 from data_synthetic import GaussianBall
 from recon.cli import main
@@ -44,15 +45,6 @@ CONFIG = {
     "reconstruction": {"checkpoint_every": 5, "draft_sources": 3},
     "specimen": {"kind": "gaussian_ball", "sigma": 0.5, "contrast": 0.02, "centre": [0.3, -0.3, 0.4]},
     "data": {"path": "simulated/stack.ome.tif"},
-}
-RESULTS = {
-    "volume.ome.tif",
-    "metrics.json",
-    "log.csv",
-    "config.resolved.toml",
-    "images.png",
-    "sections.png",
-    "misfit.png",
 }
 
 

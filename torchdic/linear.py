@@ -133,8 +133,8 @@ def linear_image(
 ) -> Float[Tensor, "prism focus y x"]:
     """The image of a specimen to first order in Δn and κ, relative to the empty bright field.
 
-    The weaker the specimen, the better it agrees with `image`. Arguments as of `image`,
-    errors as of `transfer_function`.
+    The weaker the specimen, the better it agrees with `image`. Arguments as of `image`, errors as of
+    `transfer_function`.
     """
     pad = fidelity.padding
     grid = volume.grid.widened(pad, pad)

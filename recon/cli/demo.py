@@ -21,8 +21,7 @@ ACQUISITION = Acquisition(
     [Prism(shear, bias) for shear in ((0.0, 0.24), (0.24, 0.0)) for bias in (math.pi / 2, -math.pi / 2)],
     [float(z) for z in range(-4, 5)],
 )
-# Newton's method has the wave's Hessian, which misleads straight and bent rays: they take Adam's steps, as many as gain
-# them something.
+# On straight and bent rays Newton's steps err more than Adam's: they take Adam's, as many as gain them something.
 CONTENDERS = (
     (Fidelity("projection"), Recipe(method="adam", steps=60)),
     (Fidelity("rays", sources=16, steps=10), Recipe(method="adam", steps=40)),

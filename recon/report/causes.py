@@ -18,7 +18,7 @@ from torch import Tensor
 
 from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.descent import minimise
-from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.newton.weak_hessian import check_linear_response
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
@@ -179,12 +179,12 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
 
 
 def can_be_tried(problem: Problem) -> bool:
-    """Whether short fits can be made: Newton's steps need a condenser prism and images linear in a weak specimen."""
-    microscope, acquisition = problem.setup.microscope, problem.setup.acquisition
-    sheared = any(prism is not None for prism in acquisition.prisms)
-    if microscope.lenses is not None or (sheared and not microscope.condenser_prism):
+    """Whether short fits can be made: whether Newton's method can take its steps here."""
+    try:
+        check_linear_response(problem.setup.microscope, problem.setup.acquisition)
+    except ValueError:
         return False
-    return responds_linearly(microscope, acquisition)
+    return True
 
 
 def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
@@ -296,15 +296,7 @@ def _of_the_other_sign(problem: Problem) -> Problem | None:
     """The problem with Δn on the other side of 0; None where its bounds don't end there, or a support has its own."""
     index = next(unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference))
     bounds = index.bounds
-    if (
-        isinstance(bounds, SupportedBounds)
-        or (bounds.lower is None) == (bounds.upper is None)
-        or 0
-        not in (
-            bounds.lower,
-            bounds.upper,
-        )
-    ):
+    if isinstance(bounds, SupportedBounds) or {bounds.lower, bounds.upper} != {0, None}:
         return None
     mirrored = Bounds(*(None if bound is None else -bound + 0.0 for bound in (bounds.upper, bounds.lower)))
     changed = [replace(index, bounds=mirrored) if unknown is index else unknown for unknown in problem.unknowns]

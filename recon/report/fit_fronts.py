@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from recon.report.fit_trial import FitCandidate, FitTrial
-from recon.report.fronts import FURTHER_MARKS, LEAST_ERROR, MARKS, Mark, Point, draw_points, keep_labels_apart
+from recon.report.fronts import FURTHER_MARKS, LEAST_ERROR, MARKS, Mark, Point, draw_points, laid_out, two_digits
 from torchdic.files.whole import written_whole
 
 # What is drawn against seconds and bytes, the first that is known: its name in FitTrial, and its words.
@@ -53,8 +53,8 @@ def fits_table(trials: Sequence[FitTrial]) -> str:
             _misfit(t.whole_over_noise, t.whole_misfit),
             "" if t.weight is None else f"{t.weight:.3g}",
             "" if t.steps is None else str(t.steps),
-            "" if t.seconds is None else _two_digits(t.seconds),
-            "" if t.peak_bytes is None else _two_digits(t.peak_bytes / 2**20),
+            two_digits(t.seconds),
+            two_digits(None if t.peak_bytes is None else t.peak_bytes / 2**20),
         )
         lines.append(f"| {' | '.join((*how, *numbers))} |")
     return "\n".join(lines)
@@ -62,10 +62,6 @@ def fits_table(trials: Sequence[FitTrial]) -> str:
 
 def _fixed(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
-
-
-def _two_digits(value: float) -> str:
-    return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
 def _misfit(over_noise: float | None, misfit: float | None) -> str:
@@ -99,12 +95,7 @@ def draw_fits(scenes: Mapping[str, Sequence[FitTrial]]) -> Figure:
         axes[0].set_ylabel(ERRORS[error], fontsize=8)
     handles = [grid[0, 0].plot([], [], m.marker, color=m.colour, label=name)[0] for name, m in marks.items()]
     handles += grid[0, 0].plot([], [], color="0.6", linewidth=1, label="Pareto front")
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
-    figure.draw_without_rendering()  # lays the axes out
-    figure.set_layout_engine("none")
-    for ax in grid.flat:
-        keep_labels_apart(ax)
-    return figure
+    return laid_out(figure, handles)
 
 
 def fit_marks(trials: Sequence[FitTrial]) -> dict[str, Mark]:

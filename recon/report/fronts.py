@@ -106,14 +106,15 @@ def as_table(trials: Sequence[Trial]) -> str:
         if t.failure is not None:
             lines.append(f"| {t.name} | {t.failure} |" + " |" * 7)
             continue
-        seconds = [_digits(s) for s in (t.seconds, t.gradient_seconds)]
-        mebibytes = [_digits(None if b is None else b / 2**20) for b in (t.peak_bytes, t.gradient_peak_bytes)]
+        seconds = [two_digits(s) for s in (t.seconds, t.gradient_seconds)]
+        mebibytes = [two_digits(None if b is None else b / 2**20) for b in (t.peak_bytes, t.gradient_peak_bytes)]
         errors = (t.numerical_error, t.model_error, t.numerical_gradient_error, t.model_gradient_error)
-        lines.append(f"| {' | '.join((t.name, *seconds, *mebibytes, *map(_digits, errors)))} |")
+        lines.append(f"| {' | '.join((t.name, *seconds, *mebibytes, *map(two_digits, errors)))} |")
     return "\n".join(lines)
 
 
-def _digits(value: float | None) -> str:
+def two_digits(value: float | None) -> str:
+    """A number of a table in two digits; a gap where it isn't known."""
     return "" if value is None else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
@@ -132,12 +133,16 @@ def draw_fronts(scenes: Mapping[str, Sequence[Trial]], quantities: Sequence[str]
     marks = marks_of(t.candidate.fidelity.propagation for trials in scenes.values() for t in trials)
     for (scene, quantity), axes in zip(rows, grid, strict=True):
         _draw_row(list(axes), scene, scenes[scene], quantity, marks)
-    handles = _legend_handles(grid[0, 0], marks)
+    return laid_out(figure, _legend_handles(grid[0, 0], marks))
+
+
+def laid_out(figure: Figure, handles: Sequence[Artist]) -> Figure:
+    """A figure of fronts with its legend above and its labels apart. handles: of the legend."""
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8, frameon=False)
     figure.draw_without_rendering()  # lays the axes out
     figure.set_layout_engine("none")
-    for axes in grid.flat:
-        keep_labels_apart(axes)
+    for axes in figure.axes:
+        _keep_labels_apart(axes)
     return figure
 
 
@@ -226,7 +231,7 @@ def _legend_handles(ax: Axes, marks: dict[str, Mark]) -> list[Artist]:
     return handles
 
 
-def keep_labels_apart(ax: Axes) -> None:
+def _keep_labels_apart(ax: Axes) -> None:
     """Move each label to the first of LABEL_PLACES where it hides no other label, no point and no edge."""
     renderer = ax.figure.canvas.get_renderer()  # pyright: ignore[reportAttributeAccessIssue]
     frame = ax.get_window_extent(renderer)

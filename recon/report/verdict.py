@@ -7,7 +7,7 @@ and `recon.report.causes` looks for where.
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -72,6 +72,15 @@ class Verdict:
     def poor(self) -> bool:
         """Whether the volume leaves more than noise and the model do, or more than an empty medium."""
         return leaves_too_much(self.misfit, self.noise)
+
+    @property
+    def alarming(self) -> bool:
+        """Whether to warn of it: not where a method or too few steps couldn't come closer, unless nothing is explained.
+
+        A descent that was asked for few steps, or still falls, says itself that it isn't at its end.
+        """
+        unfinished = bool(self.causes) and self.causes[0].name == FEW
+        return self.poor and (self.misfit > 1 or (self.expected and not unfinished))
 
     @property
     def words(self) -> str:
@@ -159,20 +168,20 @@ def judged(
     found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT)
     if not found.poor or not found.expected:
         return found
-    return Verdict(misfit, alone, white, _causes(problem, images, alone or 0.0, rows), free)
+    return replace(found, causes=_causes(problem, images, found, rows))
 
 
-def _causes(problem: Problem, images: Tensor, noise: float, rows: Sequence[Row]) -> tuple[Cause, ...]:
-    """What may be wrong with a poor fit, the likeliest first."""
+def _causes(problem: Problem, images: Tensor, found: Verdict, rows: Sequence[Row]) -> tuple[Cause, ...]:
+    """What may be wrong with a poor fit, the likeliest first. found: the verdict without them."""
+    noise = found.noise or 0.0
     causes = list(_unfinished(rows))
     if len(rows) >= FEW_STEPS or not rows:
         causes += seen_in_residual(images, problem.misfit, noise, problem.setup.margin)
         if can_be_tried(problem):
             print("the misfit is far above the noise's: short fits of what may have been declared wrongly …")
-            misfit = float(problem.misfit(images))
             try:
                 with torch.enable_grad():
-                    for cause in tried(problem, misfit, noise):
+                    for cause in tried(problem, found.misfit, noise):
                         causes.append(cause)
             except KeyboardInterrupt:  # the volume is found and is still to be written
                 print("the search for causes was interrupted")

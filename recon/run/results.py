@@ -21,7 +21,7 @@ from recon.fit.unknowns import IndexDifference, with_values
 from recon.recording.preparation import Measured
 from recon.report import figures
 from recon.report.metrics import residual_rms
-from recon.report.verdict import FEW, PoorFitWarning, Verdict, judged
+from recon.report.verdict import PoorFitWarning, Verdict, judged
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
 from torchdic import Grid
 from torchdic.errors import StackError
@@ -97,12 +97,8 @@ def _known(value: Any) -> Any:
 
 
 def tell(verdict: Verdict) -> None:
-    """Print the verdict, or warn PoorFitWarning of it where the volume doesn't explain the stack.
-
-    A descent that was asked for few steps, or still falls, is told only: it says itself that it isn't at its end.
-    """
-    unfinished = bool(verdict.causes) and verdict.causes[0].name == FEW
-    if verdict.poor and (verdict.misfit > 1 or (verdict.expected and not unfinished)):
+    """Print the verdict, or warn PoorFitWarning of it where the volume doesn't explain the stack."""
+    if verdict.alarming:
         warnings.warn(verdict.words, PoorFitWarning, stacklevel=3)
     else:
         print(verdict.words)

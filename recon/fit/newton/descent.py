@@ -79,9 +79,8 @@ class Place:
     resumed descent makes again. split: of the last model. correction: of the draft images.
     weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
     know it. width: of edges, over the last one. damping: λ over the Hessian's mean. accepted: number of steps that
-    were.
-    before: the misfit one accepted step earlier. moved: whether the last step was accepted. still: accepted steps in a
-    row that changed next to nothing. pairs: for the secants. records: of the weight.
+    were. before: the misfit one accepted step earlier. moved: whether the last step was accepted. still: accepted steps
+    in a row that changed next to nothing. pairs: for the secants. records: of the weight.
     """
 
     delta: Float[Tensor, "z y x"]

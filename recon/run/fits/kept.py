@@ -4,7 +4,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -74,13 +74,9 @@ class KeptTrials:
             "machine": platform.machine(),
             "identity": self.identity,
             "complete": complete,
-            "trials": [_row(trial) for trial in self.trials],
+            "trials": [asdict(trial) for trial in self.trials],
         }
         write_json(self.out / FITS, content)
-
-
-def _row(trial: FitTrial) -> dict[str, object]:
-    return {f.name: asdict(trial)[f.name] for f in fields(FitTrial)}
 
 
 def _identity(recorded: Recorded) -> str:

@@ -20,8 +20,9 @@ FEW_STEPS = {"rays": 40, "projection": 60}
 def fits_of(config: Config) -> list[FitCandidate]:
     """The fits that a configuration's [work_precision] asks for.
 
-    Newton's Hessian is the wave's: it fits by no other propagation. `linear` and `opl` have no propagation and no
-    directions of their own. Raises ConfigError for more planes than the stack has, and where nothing is left.
+    On rays Newton's steps err more than Adam's, so newton is tried by the wave alone. `linear` and `opl` have no
+    propagation and no directions of their own. Raises ConfigError for more planes than the stack has, and where nothing
+    is left.
     """
     section, stack = config.work_precision, len(config.acquisition.focus)
     methods = section.methods or (*STEPS, *DIRECT)
@@ -42,7 +43,7 @@ def fits_of(config: Config) -> list[FitCandidate]:
             found += [FitCandidate(method, propagation, directions, number) for directions in given]
     if not found:
         raise ConfigError(
-            f"work_precision: {', '.join(methods)} can't fit by {', '.join(named)}: newton needs the wave"
+            f"work_precision: {', '.join(methods)} can't fit by {', '.join(named)}: newton is tried by the wave"
         )
     return list(dict.fromkeys(found))
 

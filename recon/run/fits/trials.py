@@ -18,7 +18,6 @@ from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import with_values
 from recon.misfit.base import Misfit
-from recon.recording.background import known_levels
 from recon.recording.preparation import Measured
 from recon.report.fit_trial import FitCandidate, FitTrial
 from recon.report.metrics import volume_error
@@ -96,14 +95,13 @@ class _Fit:
         seconds = time.perf_counter() - began
         delta, truth = problem.setup.within_field(step.delta).cpu(), self.recorded.truth
         own = float(problem.misfit(model_images(problem, step)))
-        levels = known_levels(report.noise for report in self.measured.prisms)
         whole, whole_noise = self.judged(problem, step)
         return FitTrial(
             self.candidate,
             None if truth is None else volume_error(delta, truth),
             None if truth is None else float(delta.sum() / truth.sum()),
             own,
-            problem.misfit.of_noise(levels) if self.recorded.noisy else 0.0,
+            problem.misfit.of_noise(self.measured.noise) if self.recorded.noisy else 0.0,
             whole,
             whole_noise,
             step.number,
@@ -143,8 +141,7 @@ class _Fit:
         except CANNOT_CROSS:
             return None, None
         lit = images * best_brightness(images, misfit)[..., None, None]
-        levels = known_levels(report.noise for report in everything.prisms)
-        return float(misfit(lit)), misfit.of_noise(levels) if self.recorded.noisy else 0.0
+        return float(misfit(lit)), misfit.of_noise(everything.noise) if self.recorded.noisy else 0.0
 
     def whole_misfit(self) -> Misfit:
         """The configuration's misfit of the whole stack."""

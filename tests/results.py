@@ -1,0 +1,11 @@
+"""What a reconstruction leaves in its folder."""
+
+RESULTS = {
+    "volume.ome.tif",
+    "metrics.json",
+    "log.csv",
+    "config.resolved.toml",
+    "images.png",
+    "sections.png",
+    "misfit.png",
+}
