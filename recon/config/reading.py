@@ -28,19 +28,10 @@ def load(path: str | os.PathLike[str]) -> Config:
     """
     path = Path(path)
     try:
-        values = tomllib.loads(decoded(path.read_bytes()))
+        content = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:  # TOMLDecodeError is one
-        raise ConfigError(f"{path}: is not TOML: {error}") from error
-    wrong = wrong_unit(values)
-    if wrong is not None:
-        raise ConfigError(f"{path}: {wrong}")
-    try:
-        values = canonical(values)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}") from error
-    config = structure(values, Config, str(path))
+    config = parse(content, str(path))
     if config.data is not None:
         given = {"path": config.data.path, "mask": config.data.mask}
         files = {key: str((path.parent / name).resolve()) for key, name in given.items() if name is not None}
@@ -51,6 +42,25 @@ def load(path: str | os.PathLike[str]) -> Config:
         config = dataclasses.replace(config, reconstruction=section)
     _warn_of_long_shears(config, path)
     return config
+
+
+def parse(content: bytes, source: str) -> Config:
+    """A configuration from the bytes of its file. source: the file's name, with which messages begin.
+
+    Relative paths stay as they are. Raises ConfigError as `load` does.
+    """
+    try:
+        values = tomllib.loads(decoded(content))
+    except ValueError as error:  # TOMLDecodeError is one
+        raise ConfigError(f"{source}: is not TOML: {error}") from error
+    wrong = wrong_unit(values)
+    if wrong is not None:
+        raise ConfigError(f"{source}: {wrong}")
+    try:
+        values = canonical(values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{source}: {error}") from error
+    return structure(values, Config, source)
 
 
 def _warn_of_long_shears(config: Config, path: Path) -> None:
