@@ -198,13 +198,19 @@ class _Descent:
         They turn where a step's images are computed otherwise than those of the step before.
         """
 
-        def of(step: int, careful: Fidelity) -> tuple[Fidelity, Fidelity | None]:
-            coarse, fine = drafts(careful, self.problem.fidelity.draft_sources)
-            return (coarse, None) if step < COARSE_STEPS else (fine, careful if careful != fine else None)
+        fidelity = self.problem.fidelity
+        # the last step is careful even where there are few, as it leaves the fidelity that judges the volume
+        coarse = min(COARSE_STEPS, self.problem.steps - 1)
 
-        before = None if place is None else of(number - 1, self.problem.fidelity.last(self.plans))
-        careful, self.plans = self.problem.fidelity.careful(number, self.placed(place), self.plans)
-        draft, exact = of(number, careful)
+        def of(step: int) -> tuple[Fidelity, Fidelity | None]:
+            careful = fidelity.coarse if step < coarse else fidelity.last(self.plans)
+            first, fine = drafts(careful, fidelity.draft_sources)
+            return (first, None) if step < coarse else (fine, careful if careful != fine else None)
+
+        before = None if place is None else of(number - 1)
+        if number >= coarse:
+            _, self.plans = fidelity.careful(number, self.placed(place), self.plans)
+        draft, exact = of(number)
         return draft, exact, before is not None and before != (draft, exact)
 
     # --- what the model says of a place -------------------------------------------------------------------------------
