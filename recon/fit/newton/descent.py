@@ -197,18 +197,17 @@ class _Descent:
 
         They turn where a step's images are computed otherwise than those of the step before.
         """
-
         fidelity = self.problem.fidelity
-        # the last step is careful even where there are few, as it leaves the fidelity that judges the volume
-        coarse = min(COARSE_STEPS, self.problem.steps - 1)
 
         def of(step: int) -> tuple[Fidelity, Fidelity | None]:
-            careful = fidelity.coarse if step < coarse else fidelity.last(self.plans)
+            coarse = step < COARSE_STEPS
+            careful = fidelity.coarse if coarse else fidelity.last(self.plans)
             first, fine = drafts(careful, fidelity.draft_sources)
-            return (first, None) if step < coarse else (fine, careful if careful != fine else None)
+            return (first, None) if coarse else (fine, careful if careful != fine else None)
 
         before = None if place is None else of(number - 1)
-        if number >= coarse:
+        # however few steps there are, the fidelity that judges the volume is there in the end
+        if number >= min(COARSE_STEPS, self.problem.steps - 1):
             _, self.plans = fidelity.careful(number, self.placed(place), self.plans)
         draft, exact = of(number)
         return draft, exact, before is not None and before != (draft, exact)
