@@ -13,9 +13,9 @@ _TUKEY = 4.685  # Tukey's biweight: 95 % efficient on Gaussian noise
 NORMAL_MAD = 0.6745  # median of |x| for a standard normal x
 
 # Where the background falls below this part of its highest value, as a vignette does, its logarithm is tried as a
-# polynomial, of so many degrees more, and taken where the typical residual falls to this share. A vignette of cos⁴ that
-# falls to 0.25 is then followed within 4 %; the plain polynomial falls to 0.05.
-_VIGNETTE, _MORE, _BETTER = 0.75, 2, 0.8
+# polynomial, of so many degrees more, and taken where the typical residual falls to this share; below _STEEP, where it
+# falls at all. A vignette of cos⁴ that falls to 0.25 is then followed within 4 %; the plain polynomial falls to 0.05.
+_VIGNETTE, _STEEP, _MORE, _BETTER = 0.75, 0.3, 2, 0.8
 
 
 def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[np.ndarray, "y x"]:
@@ -52,7 +52,8 @@ def background_surface(image: Real[np.ndarray, "y x"], order: int = 2) -> Float[
     steep = _robust_exponential(basis(degree), values, rounding)
     residuals = [middle + basis(order) @ plain - values, np.exp(basis(degree) @ steep) - values]
     before, after = (float(np.median(np.abs(residual))) for residual in residuals)
-    return np.exp(at_pixels(steep, degree)) if after < _BETTER * before else surface
+    enough = 1.0 if surface.min() < _STEEP * surface.max() else _BETTER
+    return np.exp(at_pixels(steep, degree)) if after < enough * before else surface
 
 
 def _is_vignette(surface: np.ndarray, values: np.ndarray) -> bool:
