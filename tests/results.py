@@ -8,4 +8,5 @@ RESULTS = {
     "images.png",
     "sections.png",
     "misfit.png",
+    "checkpoint.pt",
 }

@@ -107,15 +107,18 @@ def test_path_lengths_are_left_in_µm_with_the_pixel_and_the_focus_step(write, t
 
 @OPL_SLOW
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_run_begins_anew(write, tmp_path, method):
+def test_a_second_run_begins_anew_where_asked(write, tmp_path, method, capsys):
     path, out = write(method), tmp_path / "out"
-    for options in ([], ["--resume"], ["--restart"]):
-        assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
-        delta, metrics = found(out)
-        assert metrics["steps"] == 1
-        first = delta if not options else first
-        assert torch.equal(delta, first)
-        assert not (out / "checkpoint.pt").exists()
+    assert main(["reconstruct", str(path), "--out", str(out)]) == 0
+    first, _ = found(out)
+    for options in ([], ["--resume"]):
+        assert main(["reconstruct", str(path), "--out", str(out), *options]) == 2
+        assert "metrics.json: the folder has results" in capsys.readouterr().err
+    assert main(["reconstruct", str(path), "--out", str(out), "--restart"]) == 0
+    delta, metrics = found(out)
+    assert metrics["steps"] == 1
+    assert torch.equal(delta, first)
+    assert not (out / "checkpoint.pt").exists()
 
 
 @OPL_SLOW

@@ -65,6 +65,7 @@ def run(tmp_path):
         values["reconstruction"] = {"steps": 7} | reconstruction
         (tmp_path / "config.toml").write_text(tomli_w.dumps(values), encoding="utf-8")
         out, err, folder = io.StringIO(), io.StringIO(), tmp_path / name
+        options = options or ("--restart",)
         with redirect_stdout(out), redirect_stderr(err):
             code = main(["reconstruct", str(tmp_path / "config.toml"), "--out", str(folder), *options])
         if code:

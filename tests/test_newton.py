@@ -450,11 +450,18 @@ def test_the_careful_images_correct_from_the_fine_steps_on(scene, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_fidelity_is_planned_as_the_volume_grows(scene):
+def test_a_fidelity_is_planned_once_the_volume_has_grown(scene):
     delta, setup, data, _ = scene
     steps = fitted(data, setup, Recipe(steps=14), 0.2)
-    assert len(steps[-1].plans) > 1
+    assert [plan["step"] for plan in steps[-1].plans] == [COARSE_STEPS + 1]
     assert error(steps, delta) < 0.5
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_planned_descent_of_few_steps_is_judged_by_a_plan(scene, steps):
+    _, setup, data, _ = scene
+    (*_, last) = fitted(data, setup, Recipe(steps=steps), 0.2)
+    assert [plan["step"] for plan in last.plans] == [steps]
 
 
 # going on after an interruption

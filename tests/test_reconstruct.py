@@ -267,11 +267,11 @@ def test_the_pictures_are_pictures(workplace):
         assert picture[..., :3].std() > 0.01
 
 
-def test_a_run_in_a_folder_of_results_replaces_them(other, tmp_path):
+def test_a_run_in_a_folder_of_results_replaces_them_where_asked(other, tmp_path):
     few = other({"reconstruction": {"steps": 3}})
     assert command("reconstruct", few, "--out", tmp_path / "out")[0] == 0
     few = other({"reconstruction": {"steps": 4}})
-    assert command("reconstruct", few, "--out", tmp_path / "out")[0] == 0
+    assert command("reconstruct", few, "--out", tmp_path / "out", "--restart")[0] == 0
     assert len(rows(tmp_path / "out")) == 4
     assert json.loads((tmp_path / "out" / "metrics.json").read_text(encoding="utf-8"))["steps"] == 4
     assert set(content(tmp_path / "out")) == RESULTS
@@ -389,7 +389,7 @@ def test_bad_input_leaves_earlier_results_alone(other, earlier, tmp_path):
 def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
     before = content(earlier)
     path = other({"reconstruction": {"method": "adam", "learning_rate": 1e30}})
-    code, err = command("reconstruct", path, "--out", earlier)
+    code, err = command("reconstruct", path, "--out", earlier, "--restart")
     assert code == 1
     assert "torchdic: error: the descent diverged at step 2: " in err
     assert "Traceback" not in err
@@ -446,7 +446,7 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     done = len(rows(out))
     assert 12 <= done < LONG
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
-    early = {"log.csv"} if name == "SIGKILL" else {"log.csv", "volume.ome.tif"}  # the volume so far
+    early = {"log.csv", "checkpoint.pt"} | (set() if name == "SIGKILL" else {"volume.ome.tif"})  # the volume so far
     assert RESULTS & set(content(out)) == early  # no other result is there before its time
     if name == "SIGKILL":
         assert code == -signal.SIGKILL
@@ -557,12 +557,15 @@ def test_an_interrupted_run_leaves_earlier_results_alone(other, interrupt, tmp_p
     before = content(out)
     interrupt(3)
     path = other({"reconstruction": {"steps": 5}})
-    code, err = command("reconstruct", path, "--out", out)
+    code, err = command("reconstruct", path, "--out", out, "--restart")
     assert code == 130
     assert "interrupted after step 2 of 5; go on with --resume; volume.interrupted.ome.tif holds Δn so far" in err
     after = content(out)
-    assert after.keys() - before.keys() == {"checkpoint.pt", "volume.interrupted.ome.tif"}
-    assert {name for name in before if before[name] != after[name]} <= {"log.csv"}
+    assert after.keys() - before.keys() == {"volume.interrupted.ome.tif"}
+    assert {name for name in before if before[name] != after[name]} <= {"log.csv", "checkpoint.pt"}
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 2
+    assert "an interrupted run; go on with --resume" in err
     assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
     assert set(content(out)) == RESULTS
 
@@ -586,6 +589,37 @@ def test_an_interrupted_run_goes_on_or_begins_anew_where_asked(stopped, tmp_path
     assert torch.equal(volume(out), volume(tmp_path / "whole"))
     assert [row["step"] for row in rows(out)] == list("12345678")
     assert set(content(out)) == RESULTS
+
+
+def test_a_finished_run_is_not_overwritten_unasked(other, tmp_path):
+    path, out = other({"reconstruction": {"steps": 2}}), tmp_path / "out"
+    assert command("reconstruct", path, "--out", out)[0] == 0
+    before = content(out)
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "checkpoint.pt: a finished run; go on with more steps and --resume, or begin anew with --restart" in err
+    assert content(out) == before
+    (out / "checkpoint.pt").unlink()
+    code, err = command("reconstruct", path, "--out", out, "--resume")
+    assert code == 2
+    assert "metrics.json: the folder has results; name another one, or replace them with --restart" in err
+    assert command("reconstruct", path, "--out", out, "--restart")[0] == 0
+
+
+def test_a_finished_run_goes_on_with_more_steps(other, workplace, tmp_path):
+    """As if it had had them from the start: the weight follows the noise, not the number of steps."""
+    out = tmp_path / "out"
+    whole = rows(workplace / "whole")
+    half = len(whole) - 3
+    assert command("reconstruct", other({"reconstruction": {"steps": half}}), "--out", out)[0] == 0
+    assert len(rows(out)) == half
+    assert command("reconstruct", other(), "--out", out, "--resume")[0] == 0
+    assert torch.equal(volume(out), volume(workplace / "whole"))
+    assert [row["misfit"] for row in rows(out)] == [row["misfit"] for row in whole]
+    assert command("reconstruct", other(), "--out", out, "--resume")[0] == 0  # nothing is left to do
+    assert torch.equal(volume(out), volume(workplace / "whole"))
+    assert len(rows(out)) == len(whole)
 
 
 def test_resume_without_an_interrupted_run_begins_one(other, tmp_path):
@@ -637,7 +671,6 @@ def test_an_interruption_among_the_results_goes_on_from_the_last_checkpoint(othe
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"reconstruction": {"steps": 9}}, "reconstruction.steps was 8, is 9"),
         pytest.param(
             {"reconstruction": {"steps": 8, "tv": [50.0, 5.0]}},
             "reconstruction.tv was 'auto', is [50.0, 5.0]",
