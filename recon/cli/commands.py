@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
-from recon.cli.own_stack import new
+from recon.cli.own_stack import new, phase
 from recon.config.schema import AssumedWarning, ConfigError
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
@@ -49,6 +49,11 @@ COMMANDS = {
         new.run,
         (new.arguments,),
         ("init",),
+    ),
+    "phase": Command(
+        "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
+        phase.run,
+        (phase.arguments,),
     ),
     "plan": Command(
         "find the fastest way to compute images within a tolerance, and which effects matter",

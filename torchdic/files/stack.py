@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Format, Stack, shape_text
+from torchdic.files.png import PNG
 from torchdic.files.tiff import TIFF
 from torchdic.files.vendors.nikon import ND2
 from torchdic.files.vendors.zeiss import CZI
@@ -23,7 +24,7 @@ from torchdic.files.whole import WriteError, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
-FORMATS: list[Format] = [TIFF, ND2, CZI]
+FORMATS: list[Format] = [TIFF, PNG, ND2, CZI]
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:

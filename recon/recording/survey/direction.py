@@ -42,6 +42,10 @@ _SMALLEST = 30
 # Share of the field in specimens, or their number, from which on their own directions are taken to cancel each other.
 _CROWDED, _MANY = 0.5, 8
 
+# What is left of the moment of |I − background| in that of I − background: less is chance, or bright field. Recorded
+# fibres, which lie in all directions, leave 0.1, cells and beads 0.3 to 0.7, a measured bright field 0.06.
+_FAINT = 0.08
+
 # Standard deviations of the planes' and backgrounds' directions over the error of their mean, as measured on recorded
 # beads, cells and fibres: they share the specimen, so they are not independent.
 _DEPENDENT = 2.0
@@ -119,7 +123,7 @@ def _dipole(
     images: np.ndarray, core: Bool[np.ndarray, "y x"], pixel_size: tuple[float, float]
 ) -> ShearDirection | None:
     """The direction of the summed dipoles of the specimens that stand alone; None where there are none."""
-    contrast, moments, number, noise = _contrast(images), [], 0, 0.0
+    contrast, moments, number, noise, magnitude = _contrast(images), [], 0, 0.0, 0.0
     for around in _AROUND:
         labels, count = _alone(core, contrast, around)
         if count == 0 or float((labels == 0).mean()) < _FREE:
@@ -127,7 +131,11 @@ def _dipole(
         number = max(number, count)
         noise = max(noise, _noise_of_moment(images, labels, pixel_size) / math.sqrt(len(images)))
         for order in _ORDERS:
-            moments += list(_moments(images, labels, order, pixel_size))
+            for moment, size in _moments(images, labels, order, pixel_size):
+                moments.append(moment)
+                magnitude += size
+    if abs(sum(moments)) < _FAINT * magnitude:
+        return None
     return _direction_of(np.array(moments), noise, number, _DEPENDENT if len(images) > 1 else 1.0)
 
 
@@ -176,12 +184,18 @@ def _numbered(mask: Bool[np.ndarray, "y x"]) -> tuple[np.ndarray, int]:
     return np.asarray(found[0]), int(found[1])
 
 
-def _moments(images: np.ndarray, labels: np.ndarray, order: int, pixel_size: tuple[float, float]) -> Iterator[complex]:
-    """The summed first moment of each plane, x + iy; a constant error of the background leaves it as it is."""
+def _moments(
+    images: np.ndarray, labels: np.ndarray, order: int, pixel_size: tuple[float, float]
+) -> Iterator[tuple[complex, float]]:
+    """The summed first moment of each plane, x + iy, and that of the light's magnitude.
+
+    A constant error of the background leaves the moment as it is.
+    """
     lever = _levers(labels, pixel_size)
     for image in images:
         background = background_surface(np.where(labels == 0, image, np.nan), order)
-        yield complex(((image - background) * lever).sum())
+        light = (image - background) * lever
+        yield complex(light.sum()), float(np.abs(light).sum())
 
 
 def _levers(labels: np.ndarray, pixel_size: tuple[float, float]) -> np.ndarray:
