@@ -93,8 +93,8 @@ def _direction(planes: np.ndarray, plane: int, told: float | None, aspect: float
     known = [direction for direction in found if direction is not None]
     if not known:
         raise StackError(
-            f"{source}: shows no direction of shear: no specimen stands alone in its field, within an even background; "
-            "give it by --shear-angle"
+            f"{source}: shows no direction of shear: no specimen stands alone with a bright and a dark side, "
+            "and its spectrum has no axis; give it by --shear-angle"
         )
     return min(known, key=lambda direction: (not direction.signed, direction.uncertainty))
 

@@ -46,7 +46,8 @@ class Settled:
         angles = [angle for _, angle, _ in self.prisms]
         lengths, biases = [length for length, _, _ in self.prisms], [bias for _, _, bias in self.prisms]
         all_of_them = (*lengths, *angles, *biases, self.na, self.condenser_na, self.background, self.wavelength)
-        named = [one.name for one in (*all_of_them, self.pixel_size, self.step) if one.origin == "assumed"]
+        steps = [self.step] if self.first else []
+        named = [one.name for one in (*all_of_them, self.pixel_size, *steps) if one.origin == "assumed"]
         others = [*(["order of the planes"] if self.first else []), *([] if self.lower else ["sign of Δn"])]
         return list(dict.fromkeys([*named, *others]))
 

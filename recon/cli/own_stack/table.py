@@ -76,7 +76,9 @@ def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[R
         yield "sharpest plane", f"{found.sharpest + 1} of {stack.data.shape[1]}", "measured"
     if stack.is_integer:
         shown = f"{int(found.hot.sum())}, {int(found.dead.sum())}, {found.saturated}"
-        yield "hot, dead, saturated pixels", shown, "measured, are left out"
+        alone = stack.data.shape[:2] == (1, 1)
+        origin = "measured, are left out" + (" (one image can't tell stuck ones from fine detail)" if alone else "")
+        yield "hot, dead, saturated pixels", shown, origin
     number, thickness = settled.slices
     yield "volume", f"{_counted(number, 'slice')} of {thickness:g} µm", "chosen"
 

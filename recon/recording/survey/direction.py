@@ -8,7 +8,6 @@ turns the direction of the spectrum's power (`recon.recording.shear_axis`), and 
 
 import cmath
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +22,9 @@ from recon.recording.shear_axis import estimate_shear_axis
 # Pixels over which images are smoothed before specimens are told from the field, and median contrasts (the noise of the
 # field) above which there is one at least.
 _SMOOTH, _ABOVE_FIELD = 1.5, 1.5
+
+# Contrast of a field, relative to its light, that is rounding.
+_EVEN = 1e-6
 
 # Contrast at the field's edge, relative to a specimen's greatest, from which the edge cuts it.
 _CUT = 0.3
@@ -95,17 +97,34 @@ def shear_direction(
     by at least half of what the axes of coarse and of fine detail differ by, and by 20°. A few specimens that the
     field's edge cuts show none.
     """
-    core = specimens(images)
-    found = _dipole(images, core, pixel_size)
+    contrast = _contrast(images)
+    core = _standing_out(contrast)
+    found = _dipole(images, contrast, core, pixel_size)
     if found is None and (core.mean() > _CROWDED or _numbered(core)[1] >= _MANY):
         return _spectral(images, pixel_size)
     return found
 
 
 def specimens(images: Float[np.ndarray, "focus y x"]) -> Bool[np.ndarray, "y x"]:
-    """Where in the field there is a specimen (True): its contrast in any plane stands out of the field's."""
-    contrast = _contrast(images)
-    if float(np.ptp(contrast)) <= 1e-9 * float(np.abs(images).max()):
+    """Where in the field there is a specimen (True): its contrast in any plane stands out of the field's.
+
+    images: flattened, about 1.
+    """
+    return _standing_out(_contrast(images))
+
+
+def _contrast(images: np.ndarray) -> Float[np.ndarray, "y x"]:
+    """The rms over the planes of what each smoothed pixel differs from the field by."""
+    total = np.zeros(images.shape[1:])
+    for image in images:
+        smooth = ndimage.gaussian_filter(image, _SMOOTH)
+        total += (smooth - np.median(smooth)) ** 2
+    return np.sqrt(total / len(images))
+
+
+def _standing_out(contrast: Float[np.ndarray, "y x"]) -> Bool[np.ndarray, "y x"]:
+    """Where the contrast is a specimen's."""
+    if float(np.ptp(contrast)) <= _EVEN:
         return np.zeros(contrast.shape, bool)
     threshold = max(float(filters.threshold_triangle(contrast)), _ABOVE_FIELD * float(np.median(contrast)))
     filled = ndimage.binary_fill_holes(contrast > threshold)
@@ -113,29 +132,29 @@ def specimens(images: Float[np.ndarray, "focus y x"]) -> Bool[np.ndarray, "y x"]
     return filled
 
 
-def _contrast(images: np.ndarray) -> Float[np.ndarray, "y x"]:
-    """The rms over the planes of what each smoothed pixel differs from the field by."""
-    smooth = np.stack([ndimage.gaussian_filter(image, _SMOOTH) for image in images])
-    return np.sqrt(((smooth - np.median(smooth, axis=(1, 2), keepdims=True)) ** 2).mean(0))
-
-
 def _dipole(
-    images: np.ndarray, core: Bool[np.ndarray, "y x"], pixel_size: tuple[float, float]
+    images: np.ndarray,
+    contrast: Float[np.ndarray, "y x"],
+    core: Bool[np.ndarray, "y x"],
+    pixel_size: tuple[float, float],
 ) -> ShearDirection | None:
     """The direction of the summed dipoles of the specimens that stand alone; None where there are none."""
-    contrast, moments, number, noise, magnitude = _contrast(images), [], 0, 0.0, 0.0
+    moments, number, longest, magnitude = [], 0, 0.0, 0.0
     for around in _AROUND:
         labels, count = _alone(core, contrast, around)
         if count == 0 or float((labels == 0).mean()) < _FREE:
             return None
-        number = max(number, count)
-        noise = max(noise, _noise_of_moment(images, labels, pixel_size) / math.sqrt(len(images)))
+        lever = _levers(labels, count, pixel_size)
+        number, longest = max(number, count), max(longest, float(np.linalg.norm(lever)))
         for order in _ORDERS:
-            for moment, size in _moments(images, labels, order, pixel_size):
-                moments.append(moment)
-                magnitude += size
+            for image in images:
+                light = (image - background_surface(np.where(labels == 0, image, np.nan), order)) * lever
+                moments.append(complex(light.sum()))
+                magnitude += float(np.abs(light).sum())
     if abs(sum(moments)) < _FAINT * magnitude:
         return None
+    # what noise gives the mean of all planes' moments along one direction
+    noise = (noise_level(images) or 0.0) * longest / math.sqrt(2 * len(images))
     return _direction_of(np.array(moments), noise, number, _DEPENDENT if len(images) > 1 else 1.0)
 
 
@@ -184,35 +203,19 @@ def _numbered(mask: Bool[np.ndarray, "y x"]) -> tuple[np.ndarray, int]:
     return np.asarray(found[0]), int(found[1])
 
 
-def _moments(
-    images: np.ndarray, labels: np.ndarray, order: int, pixel_size: tuple[float, float]
-) -> Iterator[tuple[complex, float]]:
-    """The summed first moment of each plane, x + iy, and that of the light's magnitude.
+def _levers(labels: np.ndarray, count: int, pixel_size: tuple[float, float]) -> np.ndarray:
+    """Each pixel's place x + iy from the middle of its specimen; 0 outside of them.
 
-    A constant error of the background leaves the moment as it is.
+    The levers of a specimen sum to 0, so that a constant error of its background leaves its moment as it is.
     """
-    lever = _levers(labels, pixel_size)
-    for image in images:
-        background = background_surface(np.where(labels == 0, image, np.nan), order)
-        light = (image - background) * lever
-        yield complex(light.sum()), float(np.abs(light).sum())
-
-
-def _levers(labels: np.ndarray, pixel_size: tuple[float, float]) -> np.ndarray:
-    """Each pixel's place x + iy from the middle of its specimen; 0 outside of them."""
     rows, columns = (np.arange(n) * side for n, side in zip(labels.shape, pixel_size, strict=True))
-    place = columns[None, :] + 1j * rows[:, None]
+    place, inside = columns[None, :] + 1j * rows[:, None], labels > 0
+    which = labels[inside]
+    sizes = np.maximum(np.bincount(which, minlength=count + 1), 1)
+    y, x = (np.bincount(which, part[inside], minlength=count + 1) / sizes for part in (place.imag, place.real))
     lever = np.zeros(labels.shape, complex)
-    for number in range(1, int(labels.max()) + 1):
-        inside = labels == number
-        lever[inside] = place[inside] - place[inside].mean()
+    lever[inside] = place[inside] - (x + 1j * y)[which]
     return lever
-
-
-def _noise_of_moment(images: np.ndarray, labels: np.ndarray, pixel_size: tuple[float, float]) -> float:
-    """The standard deviation that one plane's noise gives its moment along one direction."""
-    level = noise_level(images) or 0.0
-    return level * math.sqrt(float((np.abs(_levers(labels, pixel_size)) ** 2).sum()) / 2)
 
 
 def _spectral(images: np.ndarray, pixel_size: tuple[float, float]) -> ShearDirection | None:

@@ -17,8 +17,9 @@ def sharpness(images: Float[np.ndarray, "prism focus y x"]) -> Float[np.ndarray,
     noise is the same in all planes, and that of the least sharp plane is subtracted. A specimen of a higher index than
     its medium's gathers light: it is the sharpest some tenths of a µm behind its middle.
     """
-    curved = np.stack([[ndimage.gaussian_laplace(image, _SMOOTH) for image in planes] for planes in images])
-    energy = (curved**2).mean((2, 3))
+    energy = np.array(
+        [[float((ndimage.gaussian_laplace(image, _SMOOTH) ** 2).mean()) for image in planes] for planes in images]
+    )
     energy = (energy - energy.min(1, keepdims=True)).sum(0)
     highest = float(energy.max())
     return energy / highest if highest > 0 else np.ones_like(energy)

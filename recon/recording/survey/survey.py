@@ -94,20 +94,25 @@ def survey(stack: Stack, ratio: float) -> Survey:
 def flattened_planes(
     planes: Real[np.ndarray, "focus y x"], counted: Bool[np.ndarray, "focus y x"] | None
 ) -> Float[np.ndarray, "focus y x"]:
-    """One setting's images over their background and of equal brightness, about 1, without the pixels that don't count.
+    """One setting's images over their background and of equal brightness, about 1, float32.
+
+    Pixels that don't count have the value of the nearest one that does.
 
     Where the background isn't above 0, as of floats from which it was subtracted, the images are only brought to one
     level and spread.
     """
-    sound = planes.astype(np.float64)
-    if counted is not None:
-        sound = np.stack([nearest_counted(image, known) for image, known in zip(sound, counted, strict=True)])
+    sound = planes if counted is None else np.stack(list(map(nearest_counted, planes, counted)))
     surface = background_surface(np.median(sound, axis=0))
-    if float(surface.min()) <= 0:
-        spread = float(sound.std()) or 1.0
-        return 1 + (sound - np.median(sound, axis=(1, 2), keepdims=True)) / spread
-    flat = sound / surface
-    return flat / np.median(flat, axis=(1, 2), keepdims=True)
+    even = float(surface.min()) > 0
+    spread = 1.0 if even else float(np.std(sound, dtype=np.float64)) or 1.0
+    flat = np.empty(planes.shape, np.float32)
+    for number, image in enumerate(sound):
+        if even:
+            relative = image / surface
+            flat[number] = relative / np.median(relative)
+        else:
+            flat[number] = 1 + (image - np.median(image)) / spread
+    return flat
 
 
 def _setting(known: np.ndarray, flattened: np.ndarray, prism: int, pixel: tuple[float, float]) -> SettingSurvey:
@@ -135,12 +140,11 @@ def _setting(known: np.ndarray, flattened: np.ndarray, prism: int, pixel: tuple[
 
 def _likeness(images: np.ndarray, others: np.ndarray) -> float:
     """The correlation of two settings' images, plane by plane."""
-    first, second = (
-        (smooth - smooth.mean((1, 2), keepdims=True)).ravel()
-        for smooth in (ndimage.gaussian_filter(stack, (0, 1, 1)) for stack in (images, others))
-    )
-    size = math.sqrt(float(first @ first) * float(second @ second))
-    return float(first @ second) / size if size > 0 else 0.0
+    product = first = second = 0.0
+    for image, other in zip(images, others, strict=True):
+        a, b = ((smooth - smooth.mean()).ravel() for smooth in (ndimage.gaussian_filter(i, 1) for i in (image, other)))
+        product, first, second = product + float(a @ b), first + float(a @ a), second + float(b @ b)
+    return product / math.sqrt(first * second) if first * second > 0 else 0.0
 
 
 def _camera(stack: Stack, flattened: np.ndarray, counted: np.ndarray | None) -> DarkCounts | None:
