@@ -1,8 +1,9 @@
 """What a configuration says of a stack: what the user gave, else what the file says or its images show, or a guess."""
 
+import cmath
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from recon.config.commented import Sourced
 from recon.recording.survey.survey import SettingSurvey, Survey
@@ -120,44 +121,67 @@ def _chosen(given: float | None, said: float | None, guess: float, name: str, wh
 def _prisms(
     found: Survey, given: Mapping[str, float | None], usual: float
 ) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
-    """Length, angle and bias of each setting's shear; the first one's bias is taken as above 0."""
+    """Length, angle and bias of each setting's shear; the first bias along an axis is taken as above 0."""
     length = _chosen(given.get("shear"), None, usual, "shear's length", "λ/(2·NA), as is usual; the maker knows it")
     size = _chosen(given.get("bias"), None, _BIAS_DEGREES, "bias", "a quarter wave; the compensator shows it")
-    settings: list[tuple[Sourced, Sourced, Sourced]] = []
-    for setting in found.settings:
-        angle, sign = _angle(setting, settings, given)
-        settings.append((length, angle, replace(size, value=sign * size.value)))
-    return tuple(settings)
+    axes: list[_Axis] = []
+    places = [_place(setting, axes) for setting in found.settings]
+    lower, told = bool(given.get("lower")), given.get("shear_angle")
+    angles = [_angle(axis, None if number else told, lower=lower) for number, axis in enumerate(axes)]
+    return tuple((length, angles[axis], replace(size, value=sign * size.value)) for axis, sign in places)
 
 
-def _angle(
-    setting: SettingSurvey,
-    before: Sequence[tuple[Sourced, Sourced, Sourced]],
-    given: Mapping[str, float | None],
-) -> tuple[Sourced, float]:
-    """The angle of a setting's shear in degrees, and the sign of its bias.
+@dataclass
+class _Axis:
+    """What settings show of one axis of shear.
 
-    before: the settings before it. A setting sheared against one before it has that one's shear and the opposite bias.
-    One whose images show no direction has the first one's shear, and the opposite bias where they are its negative.
-    given: the angle is the first axis's.
+    shown: their directions as e^(iθ)/σ², turned round where the bias is below 0. signed: whether any knows which way.
     """
-    told, name, direction = given.get("shear_angle"), "shear's angle", setting.direction
-    if direction is None and before:
-        return before[0][1], -1.0 if setting.likeness < _REVERSED else 1.0
-    degrees = 0.0
-    if direction is not None:
-        degrees = math.degrees(direction.angle) + (180.0 if direction.signed and given.get("lower") else 0.0)
-        for _, earlier, bias in before:
-            apart = abs((degrees - earlier.value + 180) % 360 - 180)
-            if direction.signed and min(apart, 180 - apart) < _ONE_AXIS:
-                return earlier, math.copysign(1.0, bias.value) * (1.0 if apart < 90 else -1.0)
-    if told is not None and not before:
-        return Sourced(float(told), "given", name=name), 1.0
+
+    shown: list[complex] = field(default_factory=list)
+    signed: bool = False
+
+
+def _place(setting: SettingSurvey, axes: list[_Axis]) -> tuple[int, float]:
+    """The number of a setting's axis of shear, and the sign of its bias; adds what it shows of the axis, or a new axis.
+
+    A setting whose direction has no sign has the bias that its likeness to the first one shows, and one without a
+    direction the first one's axis too.
+    """
+    direction, likely = setting.direction, -1.0 if setting.likeness < _REVERSED else 1.0
     if direction is None:
-        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", name), 1.0
-    sure = f"± {math.degrees(direction.uncertainty):.0f}°"
-    if direction.signed:
-        why = f"{sure}, if Δn is {'below' if given.get('lower') else 'above'} 0 and the bias between 0° and 180°"
+        if not axes:
+            axes.append(_Axis())
+        return 0, likely
+    shown = cmath.rect(1 / direction.uncertainty**2, direction.angle)
+    for number, axis in enumerate(axes):
+        along = likely if not axis.shown else math.copysign(1.0, (shown / sum(axis.shown)).real)
+        apart = 0.0 if not axis.shown else abs(math.degrees(cmath.phase(along * shown / sum(axis.shown))))
+        if apart < _ONE_AXIS:
+            axis.shown.append(along * shown)
+            sign = along if direction.signed and (axis.signed or len(axis.shown) == 1) else likely
+            axis.signed |= direction.signed
+            return number, sign
+    axes.append(_Axis([shown], direction.signed))
+    return len(axes) - 1, 1.0
+
+
+def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
+    """The angle of an axis in degrees, from what its settings show together.
+
+    Its uncertainty is that of their weighted mean, or half of how far they are apart where that is more.
+    """
+    name = "shear's angle"
+    if told is not None:
+        return Sourced(float(told), "given", name=name)
+    if not axis.shown:
+        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", name)
+    mean = sum(axis.shown)
+    beside = max(abs(math.degrees(cmath.phase(one / mean))) for one in axis.shown)
+    sure = max(math.degrees(1 / math.sqrt(sum(map(abs, axis.shown)))), beside / 2)
+    degrees = math.degrees(cmath.phase(mean)) + (180 if lower and axis.signed else 0)
+    if axis.signed:
+        why = f"± {sure:.0f}°, if Δn is {'below' if lower else 'above'} 0 and the bias between 0° and 180°"
     else:
-        why = f"{sure}, or the opposite: the images don't show which"
-    return Sourced(round(degrees % 360, 1), "measured", why, name), 1.0
+        why = f"± {sure:.0f}°, or the opposite: the images don't show which"
+    return Sourced(round(degrees % 360, 1), "measured", why, name)
