@@ -241,7 +241,7 @@ def test_a_recording_in_few_bits_says_them(tmp_path, recording, capsys):
     assert "12 bits" in capsys.readouterr().out
 
 
-def setting(degrees, sure=3.0, likeness=1.0, *, signed=True):
+def setting(degrees, sure=3.0, likeness=(), *, signed=True):
     """What a setting's images tell; None for degrees shows no direction."""
     direction = None
     if degrees is not None:
@@ -251,8 +251,8 @@ def setting(degrees, sure=3.0, likeness=1.0, *, signed=True):
 
 LAYOUTS = {
     "one": ([setting(40)], [(40, 90)]),
-    "a pair of biases": ([setting(38), setting(222, likeness=-0.8)], [(40, 90), (40, -90)]),
-    "two shears across": ([setting(40), setting(130, likeness=0.0)], [(40, 90), (130, 90)]),
+    "a pair of biases": ([setting(38), setting(222, likeness=(-0.8,))], [(40, 90), (40, -90)]),
+    "two shears across": ([setting(40), setting(130, likeness=(0.9,))], [(40, 90), (130, 90)]),
     "two pairs": (
         [setting(41), setting(219), setting(309), setting(131)],
         [(40, 90), (40, -90), (310, 90), (310, -90)],
@@ -261,11 +261,16 @@ LAYOUTS = {
         [setting(d) for d in (40, 40, 220, 130, 130, 310)],
         [(40, 90), (40, 90), (40, -90), (130, 90), (130, 90), (130, -90)],
     ),
-    "the second shows none": ([setting(40), setting(None, likeness=-0.7)], [(40, 90), (40, -90)]),
-    "the first shows none": ([setting(None), setting(220, likeness=-0.7)], [(40, 90), (40, -90)]),
-    "none shows any": ([setting(None), setting(None, likeness=0.9)], [(45, 90), (45, 90)]),
+    "the second shows none": ([setting(40), setting(None, likeness=(0.2,))], [(40, 90), (40, -90)]),
+    "the second is as the first": ([setting(40), setting(None, likeness=(0.9,))], [(40, 90), (40, 90)]),
+    "the fourth shows none": (
+        [setting(40), setting(220), setting(130), setting(None, likeness=(0.1, 0.2, -0.1))],
+        [(40, 90), (40, -90), (130, 90), (130, -90)],
+    ),
+    "the first shows none": ([setting(None), setting(220, likeness=(0.2,))], [(40, 90), (40, -90)]),
+    "none shows any": ([setting(None), setting(None, likeness=(0.9,))], [(45, 90), (45, 90)]),
     "crowded, without a sign": (
-        [setting(40, 20, signed=False), setting(44, 20, -0.7, signed=False)],
+        [setting(40, 20, signed=False), setting(44, 20, (-0.7,), signed=False)],
         [(42, 90), (42, -90)],
     ),
     "the surer counts more": ([setting(40, 1.0), setting(230, 3.0)], [(41, 90), (41, -90)]),
@@ -276,14 +281,15 @@ LAYOUTS = {
 def test_settings_along_one_axis_share_its_angle_and_differ_in_bias(name):
     settings, expected = LAYOUTS[name]
     nothing = np.zeros((4, 4), bool)
+    alike = [replace(each, likeness=each.likeness or (0.0,) * number) for number, each in enumerate(settings)]
     stack = Stack(np.ones((len(settings), 3, 4, 4), np.uint16))
-    settled = settle(Gathered(stack, (), StatedSetup()), Survey(tuple(settings), 1, None, nothing, nothing, 0), {})
+    settled = settle(Gathered(stack, (), StatedSetup()), Survey(tuple(alike), 1, None, nothing, nothing, 0), {})
     found = [(angle.value, bias.value) for _, angle, bias in settled.prisms]
     assert found == [(pytest.approx(angle, abs=0.1), bias) for angle, bias in expected]
 
 
 def test_the_angle_is_as_uncertain_as_its_settings_are_apart():
     nothing = np.zeros((4, 4), bool)
-    found = Survey((setting(30, 2), setting(230, 2)), 1, None, nothing, nothing, 0)
+    found = Survey((setting(30, 2), setting(230, 2, (0.0,))), 1, None, nothing, nothing, 0)
     settled = settle(Gathered(Stack(np.ones((2, 3, 4, 4), np.uint16)), (), StatedSetup()), found, {})
     assert settled.prisms[0][1].why.startswith("± 5°")

@@ -2,8 +2,10 @@
 
 import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from recon.config.commented import Sourced
 from recon.recording.survey.survey import SettingSurvey, Survey
@@ -15,8 +17,8 @@ WAVELENGTH, NA, BACKGROUND, _BIAS_DEGREES, _ANGLE_DEGREES = 0.55, 0.9, 1.335, 90
 # Slices are no thicker than this many µm: light bends within them.
 _THICKEST = 1.0
 
-# Correlation of a setting's images with the first one's, below which its bias is the opposite.
-_REVERSED = -0.2
+# Correlation of two settings' images, below which they aren't the same setting.
+_UNLIKE = 0.5
 
 # Of two settings' directions of shear, in degrees: below this apart they lie along one axis.
 _ONE_AXIS = 45.0
@@ -125,7 +127,9 @@ def _prisms(
     length = _chosen(given.get("shear"), None, usual, "shear's length", "λ/(2·NA), as is usual; the maker knows it")
     size = _chosen(given.get("bias"), None, _BIAS_DEGREES, "bias", "a quarter wave; the compensator shows it")
     axes: list[_Axis] = []
-    places = [_place(setting, axes) for setting in found.settings]
+    places: list[tuple[int, float]] = []
+    for setting in found.settings:
+        places.append(_place(setting, axes, places))
     lower, told = bool(given.get("lower")), given.get("shear_angle")
     angles = [_angle(axis, None if number else told, lower=lower) for number, axis in enumerate(axes)]
     return tuple((length, angles[axis], replace(size, value=sign * size.value)) for axis, sign in places)
@@ -142,17 +146,17 @@ class _Axis:
     signed: bool = False
 
 
-def _place(setting: SettingSurvey, axes: list[_Axis]) -> tuple[int, float]:
+def _place(setting: SettingSurvey, axes: list[_Axis], places: Sequence[tuple[int, float]]) -> tuple[int, float]:
     """The number of a setting's axis of shear, and the sign of its bias; adds what it shows of the axis, or a new axis.
 
-    A setting whose direction has no sign has the bias that its likeness to the first one shows, and one without a
-    direction the first one's axis too.
+    places: of the settings before it. A setting whose direction has no sign has the bias that its likeness to those
+    shows, and one without a direction the axis too.
     """
-    direction, likely = setting.direction, -1.0 if setting.likeness < _REVERSED else 1.0
+    direction, (near, likely) = setting.direction, _likely(setting, places)
     if direction is None:
         if not axes:
             axes.append(_Axis())
-        return 0, likely
+        return near, likely
     shown = cmath.rect(1 / direction.uncertainty**2, direction.angle)
     for number, axis in enumerate(axes):
         along = likely if not axis.shown else math.copysign(1.0, (shown / sum(axis.shown)).real)
@@ -164,6 +168,20 @@ def _place(setting: SettingSurvey, axes: list[_Axis]) -> tuple[int, float]:
             return number, sign
     axes.append(_Axis([shown], direction.signed))
     return len(axes) - 1, 1.0
+
+
+def _likely(setting: SettingSurvey, places: Sequence[tuple[int, float]]) -> tuple[int, float]:
+    """The axis and the sign of the bias of a setting whose images show neither, by their likeness to others'.
+
+    What all settings have in common, as out of focus, makes them alike; opposite biases on one axis are the least so.
+    """
+    if not places:
+        return 0, 1.0
+    least = int(np.argmin(setting.likeness))
+    if setting.likeness[least] < _UNLIKE:
+        axis, sign = places[least]
+        return axis, -sign
+    return places[int(np.argmax(setting.likeness))]
 
 
 def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:

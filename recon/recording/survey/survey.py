@@ -28,7 +28,7 @@ class SettingSurvey:
     flicker: standard deviation of the planes' brightness; brightness: of each plane; both relative to their mean.
     noise: standard deviation of a pixel's noise, in the file's unit; None where images are too small to tell.
     direction: of the shear; None where the images show none.
-    likeness: correlation of the images with those of the first setting, from −1 to 1.
+    likeness: correlation of the images with those of each setting before, from −1 to 1.
     """
 
     level: float
@@ -38,7 +38,7 @@ class SettingSurvey:
     brightness: Float[np.ndarray, " focus"]
     noise: float | None
     direction: ShearDirection | None
-    likeness: float
+    likeness: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def _setting(known: np.ndarray, flattened: np.ndarray, prism: int, pixel: tuple[
         brightness=brightness / mean if mean > 0 else np.ones_like(brightness),
         noise=noise_level(known),
         direction=shear_direction(flat, pixel),
-        likeness=_likeness(flat, flattened[0]),
+        likeness=tuple(_likeness(flat, other) for other in flattened[:prism]),
     )
 
 
