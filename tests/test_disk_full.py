@@ -130,7 +130,7 @@ def test_a_volume_without_room_is_written_compressed(run, full, monkeypatch, tmp
     imwrite = tifffile.imwrite
 
     def needs_room(path, data, **options):
-        if options.get("compression") is None and path.parent.name == "out":
+        if options.get("compression") is None and data.size == 4 * 14 * 12:  # the volume
             raise OSError(f"{data.size} requested and 0 written")  # as numpy says it
         imwrite(path, data, **options)
 

@@ -16,7 +16,7 @@ from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
 from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
-from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -108,15 +108,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _show_each_warning_once() -> None:
-    """Show each warning once, as one line above the progress bar.
+    """Show each warning once, as one line above the progress bar; of each kind about images, the first.
 
-    Python's own rule "once" would show a warning again for each module that it comes from.
+    Python's own rule "once" would show a warning again for each module that it comes from. A descent's images change
+    from step to step, and with them the digits of a warning about them.
     """
-    shown: set[str] = set()
+    shown: set[object] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if str(message) not in shown:
-            shown.add(str(message))
+        kind = type(message) if isinstance(message, BatchWarning) else str(message)
+        if kind not in shown:
+            shown.add(kind)
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show
