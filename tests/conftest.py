@@ -32,7 +32,8 @@ def checked_at_first(*, typechecker: Any) -> Callable:
 
     A function that another one defines is checked the first 20 times that it is defined: the import hook decorates each
     definition, to build the check takes milliseconds, and a solver defines functions at every step. Any other function
-    is checked at its first `most_calls` calls in each test.
+    is checked at its first `most_calls` calls in each test. A function's check is built when it is first called: a
+    process imports all functions and calls some.
     """
     check = jaxtyped(typechecker=typechecker)
 
@@ -43,12 +44,17 @@ def checked_at_first(*, typechecker: Any) -> Callable:
         if "<locals>" in function.__qualname__:
             made[code] += 1
             return check(function) if made[code] <= 20 else function
-        checked = check(function)
+        checked = None
 
         @functools.wraps(function)
         def call(*arguments: Any, **named: Any) -> Any:
+            nonlocal checked
             called[code] += 1
-            return (checked if called[code] <= most_calls else function)(*arguments, **named)
+            if called[code] > most_calls:
+                return function(*arguments, **named)
+            if checked is None:
+                checked = check(function)
+            return checked(*arguments, **named)
 
         return call
 
