@@ -455,7 +455,7 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
 
 
 @pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")
-@pytest.mark.parametrize("more", [{}, {"fidelity": ..., "tolerance": 0.3}])
+@pytest.mark.parametrize("more", [{}, pytest.param({"fidelity": ..., "tolerance": 0.3}, marks=pytest.mark.slow)])
 def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, more):
     """With oil behind 3 µm of water, the condenser's too, and with a planned fidelity."""
     layer = {"thickness": 3.0, "index": 1.335, "design_index": 1.515}

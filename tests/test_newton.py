@@ -175,7 +175,7 @@ def test_the_result_scales_with_the_datas_contrast(scene):
     results = []
     for height in (0.004, 0.0004):
         setup = setup_of(bead(height))
-        steps = fitted(*recorded(setup, 0.3)[:1], setup)
+        steps = fitted(*recorded(setup, 0.3)[:1], setup, Recipe(steps=9))
         results.append(steps[-1].delta / height)
     assert volume_error(results[1], results[0]) < 0.08
 
@@ -357,9 +357,10 @@ def test_hot_pixels_hardly_move_a_robust_fit(scene):
     delta, setup, data, _ = scene
     hot = data.clone()
     hot[torch.rand(data.shape, generator=torch.Generator().manual_seed(5)) < 0.01] += 0.2
-    clean = error(fitted(data, setup, misfit=RobustMisfit), delta)
-    assert error(fitted(hot, setup, misfit=RobustMisfit), delta) < 1.2 * clean
-    assert error(fitted(hot, setup), delta) > 1.5 * clean
+    few = Recipe(steps=9)
+    clean = error(fitted(data, setup, few, misfit=RobustMisfit), delta)
+    assert error(fitted(hot, setup, few, misfit=RobustMisfit), delta) < 1.2 * clean
+    assert error(fitted(hot, setup, few), delta) > 1.5 * clean
 
 
 # nuisances
@@ -480,7 +481,7 @@ def test_resuming_from_any_step_ends_where_an_uninterrupted_run_does(case, scene
     recipe, fidelity = RESUMED[case]
     problem = problem_of(data, setup, recipe, fidelity)
     steps = list(minimise(problem))
-    for k in (0, 3, *range(COARSE_STEPS - 2, len(steps))):
+    for k in (0, COARSE_STEPS - 1, COARSE_STEPS, len(steps) - 2, len(steps) - 1):
         (*rest,) = minimise(problem, steps[k])
         assert len(rest) == len(steps) - 1 - k
         assert all(alike(a, b) for a, b in zip(rest, steps[k + 1 :], strict=True))
