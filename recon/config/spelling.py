@@ -19,10 +19,17 @@ DEGREES = "_degrees"
 # Further keys of a table, beside the fields of its dataclass, by the dataclass's name.
 _OF_PRISMS = tuple(f"{angle}{DEGREES}" for angle in ANGLES)
 FURTHER: dict[str, tuple[str, ...]] = {
+    "Config": ("include",),
     "VolumeSection": ("pixel_size", "slice_thickness"),
     "Prism": _OF_PRISMS,
     "CompensatorSection": _OF_PRISMS,
     "WedgeSection": _OF_PRISMS,
+}
+
+# Sets of keys that exclude each other because they say the same, by the key of their table.
+ALTERNATIVES: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
+    "": ((("tolerance",), ("fidelity",)),),
+    "volume": ((("spacing",), ("pixel_size", "slice_thickness")),),
 }
 
 Table = dict[str, Any]
