@@ -76,7 +76,7 @@ def _recorded(config: Config, source: str, device: torch.device) -> Recorded:
     if config.specimen is None:
         if config.data is None:
             raise ConfigError(f"{source}: missing key specimen or data.path: fits need a known specimen or a stack")
-        print(f"{config.data.path}: the truth isn't known; the misfit over the noise is all that is told")
+        print(f"{', '.join(config.data.files)}: the truth isn't known; the misfit over the noise is all that is told")
         return Recorded(config, load_data(config), None, device)
     specimen, model, grid = specimen_of(config, source), FinerModel(), config.volume.grid
     exact = hasattr(specimen, "field")

@@ -14,7 +14,7 @@ from recon.config.spelling import ALTERNATIVES
 INCLUDE = "include"
 
 # Values that name a file, by their keys; words that stand in a file's place.
-_FILES = (("data", "path"), ("data", "mask"), ("reconstruction", "support"))
+_FILES = (("data", "path"), ("data", "paths"), ("data", "mask"), ("reconstruction", "support"))
 _WORDS = ("none", "edges")
 
 Table = dict[str, Any]
@@ -96,11 +96,17 @@ def _from_folder(values: Table, folder: Path) -> Table:
     """The values with relative names of files starting from a folder."""
 
     def absolute(name: Any) -> Any:
+        if isinstance(name, list):
+            return [absolute(one) for one in name]
         return str((folder / name).resolve()) if isinstance(name, str) and name not in _WORDS else name
 
     for section, key in _FILES:
         values = _changed(values, section, lambda table, key=key: _changed(table, key, absolute))
-    return values
+
+    def prisms(found: Any) -> Any:
+        return [_changed(prism, "file", absolute) for prism in found] if isinstance(found, list) else found
+
+    return _changed(values, "acquisition", lambda table: _changed(table, "prisms", prisms))
 
 
 def _changed(table: Any, key: str, change: Callable[[Any], Any]) -> Any:

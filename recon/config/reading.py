@@ -40,6 +40,8 @@ def load(path: str | os.PathLike[str]) -> Config:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{source}: {error}") from error
     config = structure(values, Config, source)
+    if config.data is not None and not config.data.files:
+        raise ConfigError(f"{source}: missing key data.path")
     _warn_of_long_shears(config, path)
     return config
 

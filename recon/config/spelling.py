@@ -17,7 +17,7 @@ ANGLES = ("bias", "polariser", "axis", "wedge")
 DEGREES = "_degrees"
 
 # Further keys of a table, beside the fields of its dataclass, by the dataclass's name.
-_OF_PRISMS = tuple(f"{angle}{DEGREES}" for angle in ANGLES)
+_OF_PRISMS = (*(f"{angle}{DEGREES}" for angle in ANGLES), "file", "channel")
 FURTHER: dict[str, tuple[str, ...]] = {
     "Config": ("include",),
     "VolumeSection": ("pixel_size", "slice_thickness"),
@@ -30,7 +30,11 @@ FURTHER: dict[str, tuple[str, ...]] = {
 ALTERNATIVES: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
     "": ((("tolerance",), ("fidelity",)),),
     "volume": ((("spacing",), ("pixel_size", "slice_thickness")),),
+    "data": ((("path",), ("paths",)),),
 }
+
+# The name by which a list of prisms holds bright field, which has none.
+BRIGHT_FIELD = "brightfield"
 
 Table = dict[str, Any]
 
@@ -47,6 +51,8 @@ def canonical(values: Mapping[str, Any]) -> Table:
         known["volume"] = _volume(known["volume"])
     if isinstance(known.get("acquisition"), dict):
         known["acquisition"] = _acquisition(known["acquisition"])
+        if isinstance(known["acquisition"].get("prisms"), list):
+            known = _recordings(known, known["acquisition"]["prisms"])
     return known
 
 
@@ -115,8 +121,10 @@ def _planes(table: Table) -> list[float]:
     return [float(f"{start + number * width:.13g}") for number in range(count)]
 
 
-def _prism(table: Table, key: str) -> Table:
-    """A prism with its shear as (y, x) and its angles in rad."""
+def _prism(table: Table, key: str) -> Table | str:
+    """A prism with its shear as (y, x) and its angles in rad; bright field by its name."""
+    if table == {BRIGHT_FIELD: True}:
+        return BRIGHT_FIELD
     changed = dict(table)
     for angle in ANGLES:
         named = f"{angle}{DEGREES}"
@@ -133,6 +141,43 @@ def _prism(table: Table, key: str) -> Table:
         )
         changed["shear"] = list(direction(length, degrees))
     return changed
+
+
+def _recordings(values: Table, prisms: list[Any]) -> Table:
+    """The file and the channel of each prism's images as [data] lists them.
+
+    A table that says nothing but that it is bright field, and where its images are, becomes the name of bright field.
+    """
+    files, channels = (_of_each(prisms, key) for key in ("file", "channel"))
+    if files is None and channels is None:
+        return values
+    data = values.get("data", {})
+    if not isinstance(data, dict):
+        return values
+    for each, given, others in (("file", files, ("path", "paths")), ("channel", channels, ("channels",))):
+        for other in others:
+            if given is not None and other in data:
+                raise ValueError(f"data.{other} and acquisition.prisms[0].{each} say the same: leave one out")
+    bare = [_without_recording(prism) if isinstance(prism, dict) else prism for prism in prisms]
+    listed = {key: given for key, given in (("paths", files), ("channels", channels)) if given is not None}
+    return {**values, "acquisition": {**values["acquisition"], "prisms": bare}, "data": {**data, **listed}}
+
+
+def _of_each(prisms: list[Any], key: str) -> list[Any] | None:
+    """A key's value of each prism; None where no prism has it. Raises ValueError where some have it."""
+    having = [isinstance(prism, dict) and key in prism for prism in prisms]
+    if not any(having):
+        return None
+    if not all(having):
+        index = having.index(False)
+        hint = "" if isinstance(prisms[index], dict) else f", as in {{ brightfield = true, {key} = … }}"
+        raise ValueError(f"missing key acquisition.prisms[{index}].{key}: every prism has one, or none does{hint}")
+    return [prism[key] for prism in prisms]
+
+
+def _without_recording(prism: Table) -> Any:
+    bare = {key: value for key, value in prism.items() if key not in ("file", "channel")}
+    return BRIGHT_FIELD if bare == {BRIGHT_FIELD: True} else bare
 
 
 def _parts(table: Table, key: str, names: tuple[str, ...]) -> list[Any]:

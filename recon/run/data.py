@@ -16,6 +16,7 @@ from recon.recording.support import edges_support
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
+from torchdic.files.joined import read_joined
 from torchdic.files.stack import read_stack
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
@@ -28,10 +29,11 @@ def load_data(config: Config) -> Measured:
     Raises ConfigError where the configuration has no stack or asks for what can't be reconstructed, and StackError
     where the file is no stack of its acquisition or shows nothing.
     """
-    if config.data is None:
+    section = config.data
+    if section is None or not section.files:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     check_feasible(config)
-    return prepared(config, read_stack(config.data.path, config.data.series))
+    return prepared(config, read_joined(section.files, section.channels, section.series))
 
 
 def prepared(config: Config, stack: Stack) -> Measured:
