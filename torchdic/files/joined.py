@@ -14,9 +14,7 @@ from torchdic.files.stack import read_stack
 _TOLERANCE = 0.01
 
 
-def read_joined(
-    paths: Sequence[str], channels: Sequence[int] | None = None, series: int | None = None
-) -> Stack:
+def read_joined(paths: Sequence[str], channels: Sequence[int] | None = None, series: int | None = None) -> Stack:
     """The stack whose prisms are the channels of files.
 
     paths: of the files, each as `read_stack` takes it. A file that is named more than once is read once.
