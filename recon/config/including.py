@@ -14,7 +14,7 @@ from recon.config.spelling import ALTERNATIVES
 INCLUDE = "include"
 
 # Values that name a file, by their keys; words that stand in a file's place.
-_FILES = (("data", "path"), ("data", "paths"), ("data", "mask"), ("reconstruction", "support"))
+_FILES = (*(("data", key) for key in ("path", "paths", "mask", "empty")), ("reconstruction", "support"))
 _WORDS = ("none", "edges")
 
 Table = dict[str, Any]

@@ -103,9 +103,12 @@ class DataSection:
     series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
         relative path starts from the configuration's folder. None is all pixels.
+    empty: an image or a stack of the empty field, by which the stack is divided in place of a fitted background, see
+        `recon.recording.empty_field`; a relative path starts from the configuration's folder. None is none.
     stuck: "auto" looks for pixels of the camera that are dead, hot or stuck at a value; None trusts them all.
     Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, an order, a
-    channel or a series below 0, both path and paths, and channels that aren't as many as the paths.
+    channel or a series below 0, both path and paths, channels that aren't as many as the paths, and an empty field
+    that nothing is to be divided by.
     """
 
     path: str | None = None
@@ -120,6 +123,7 @@ class DataSection:
     stuck: Literal["auto"] | None = "auto"
     paths: tuple[str, ...] | None = None
     channels: tuple[int, ...] | None = None
+    empty: str | None = None
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -129,6 +133,8 @@ class DataSection:
     def __post_init__(self) -> None:
         if self.path is not None and self.paths is not None:
             raise ValueError("path and paths say the same: leave one out")
+        if self.empty is not None and self.flatten is False:
+            raise ValueError("empty divides the images, flatten = false says not to: leave one out")
         if self.paths == ():
             raise ValueError("paths must hold at least one file")
         if self.channels is not None:

@@ -9,6 +9,7 @@ from torch import Tensor
 from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
 from recon.misfit.base import spatial_variance
+from recon.recording.empty_field import EmptyField, empty_field
 from recon.recording.masks import LeftOut, counted_pixels, left_out
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
@@ -51,7 +52,13 @@ def prepared(config: Config, stack: Stack) -> Measured:
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
     check_counts(stack, expected)
-    measured = prepare(stack, expected, normalisation, _left_out(config, section, stack))
+    ratio = None
+    if section.stuck is not None:
+        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:], config.volume.background)
+    empty = None
+    if section.empty is not None:
+        empty = empty_field(read_stack(section.empty), stack, section.offset, ratio)
+    measured = prepare(stack, expected, normalisation, _left_out(section, stack, ratio, empty), empty)
     counted = measured.left_out.counted
     try:
         spatial_variance(torch.from_numpy(measured.data), None if counted is None else torch.from_numpy(counted))
@@ -60,13 +67,16 @@ def prepared(config: Config, stack: Stack) -> Measured:
     return measured
 
 
-def _left_out(config: Config, section: DataSection, stack: Stack) -> LeftOut:
-    """The pixels of a stack that don't count; a line says how many."""
+def _left_out(section: DataSection, stack: Stack, ratio: float | None, empty: EmptyField | None) -> LeftOut:
+    """The pixels of a stack that don't count; a line says how many.
+
+    ratio: how far a pixel may stand out of its neighbours; None looks for no stuck pixels. empty: has bad pixels too.
+    """
     mask = None if section.mask is None else read_stack(section.mask).data != 0
-    stuck = None
-    if section.stuck is not None:
-        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:], config.volume.background)
-        stuck = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask))
+    stuck = None if empty is None else empty.bad
+    if ratio is not None:
+        own = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask, stuck))
+        stuck = own if stuck is None else own | stuck
     found = left_out(stack, mask, stuck)
     if str(found):
         print(found)
