@@ -39,6 +39,7 @@ class ExpectedStack:
     focus: one per plane, µm.
     pixel_size: (y, x) in µm, used in place of the file's; None uses the file's.
     pixels: (y, x), the number of pixels; None accepts any.
+    field: (y, x) in µm, of the volume that a camera sees with pixels of its own; None where pixels are voxels.
     empty: one per prism, the intensity of the empty field, relative to the empty bright field; None is what ideal
         polarisers give, sin²(bias/2), and 1 in bright field.
     """
@@ -48,6 +49,7 @@ class ExpectedStack:
     pixel_size: tuple[float, float] | None = None
     pixels: tuple[int, int] | None = None
     empty: tuple[float, ...] | None = None
+    field: tuple[float, float] | None = None
 
     @property
     def empty_levels(self) -> tuple[float, ...]:
@@ -288,9 +290,12 @@ def check_counts(stack: Stack, expected: ExpectedStack) -> None:
         )
     pixels = expected.pixels
     if pixels is not None and held[2:] != tuple(pixels):
-        raise StackError(
-            f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), the volume {pixels[0]} × {pixels[1]}"
-        )
+        volume, (ny, nx) = "the volume", pixels
+        if expected.field is not None and expected.pixel_size is not None:
+            height, width = expected.field
+            side = expected.pixel_size[0]
+            volume = f"the volume of {height:.4g} × {width:.4g} µm in whole pixels of the camera, of {side:.4g} µm,"
+        raise StackError(f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), {volume} {ny} × {nx}")
 
 
 def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tuple[float, float]:

@@ -8,6 +8,8 @@ from torch import Tensor
 
 from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.problem import DIRECT
+from recon.fit.setup import on_voxels, pixels_of
 from recon.misfit.base import spatial_variance
 from recon.recording.empty_field import EmptyField, empty_field
 from recon.recording.masks import LeftOut, counted_pixels, left_out
@@ -42,19 +44,20 @@ def prepared(config: Config, stack: Stack) -> Measured:
 
     Raises StackError where it is no stack of this acquisition or shows nothing.
     """
-    section = config.data or DataSection(stack.source)
+    section, pixels = config.data or DataSection(stack.source), camera_pixels(config)
     expected = ExpectedStack(
         biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
         focus=tuple(float(focus) for focus in config.acquisition.focus),
-        pixel_size=config.volume.spacing[1:],
-        pixels=config.volume.shape[1:],
+        pixel_size=pixels.spacing[1:],
+        pixels=pixels.shape[1:],
+        field=config.volume.grid.extent[1:] if pixels is not config.volume.grid else None,
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
     check_counts(stack, expected)
     ratio = None
     if section.stuck is not None:
-        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:], config.volume.background)
+        ratio = sharpest(config.microscope, stack.pixel_size or pixels.spacing[1:], config.volume.background)
     empty = None
     if section.empty is not None:
         empty = empty_field(read_stack(section.empty), stack, section.offset, ratio)
@@ -92,7 +95,9 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     if named is None:
         return None
     if named == "edges":
-        found = edges_support(measured.data, measured.focus, grid, config.microscope, config.volume.background)
+        pixels, images = camera_pixels(config), torch.from_numpy(measured.data)
+        data = measured.data if pixels == grid else on_voxels(images, pixels, grid).numpy()
+        found = edges_support(data, measured.focus, grid, config.microscope, config.volume.background)
     else:
         mask = read_stack(named).data != 0
         if mask.shape not in ((1, *grid.shape), (1, 1, *grid.shape[1:])):
@@ -105,20 +110,26 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     return torch.from_numpy(found)
 
 
-def check_pixels(config: Config) -> None:
-    """Raise ConfigError where the camera's pixels aren't the volume's voxels."""
-    camera = config.microscope.camera
-    if camera is not None and camera.pixel_size is not None:
-        raise ConfigError(
-            f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
-            "volume's voxels"
-        )
+def camera_pixels(config: Config) -> Grid:
+    """The pixels of a configuration's images as a grid (z, y, x): the camera's, or the volume's voxels.
+
+    Raises ConfigError where none of the camera's fits into the volume.
+    """
+    try:
+        return pixels_of(config.volume.grid, config.microscope)
+    except ValueError as error:
+        raise ConfigError(f"microscope.camera.pixel_size: {error}") from error
 
 
 def check_feasible(config: Config) -> None:
     """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
-    check_pixels(config)
-    if config.reconstruction.method == "opl" and config.reconstruction.support is not None:
+    camera, method = config.microscope.camera, config.reconstruction.method
+    if method in DIRECT and camera is not None and camera.pixel_size is not None:
+        raise ConfigError(
+            f"reconstruction.method: {method!r} takes pixels that are voxels, microscope.camera.pixel_size is "
+            f"{camera.pixel_size:g}; use 'newton' or 'adam', or leave it out and give voxels the size of the pixels"
+        )
+    if method == "opl" and config.reconstruction.support is not None:
         raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
     section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
     if section.method in ("newton", "linear"):
