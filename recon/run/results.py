@@ -142,7 +142,7 @@ def write_results(
         write_stack(out / IMAGES, pairs, measured.pixel_size, step, names=names)
 
     def draw_images() -> None:
-        figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, grid)
+        figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)
         figures.save(figures.headed(figure, verdict.words), out / "images.png")
 
     def draw_misfit() -> None:
