@@ -8,7 +8,7 @@ import torch
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
-from recon.run.forecast import Bar, Forecast
+from recon.report.forecast import Bar, Forecast
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 
 GRID = Grid((4, 12, 10), (0.5, 0.25, 0.25))

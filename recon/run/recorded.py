@@ -8,8 +8,8 @@ from recon.fit.descent import minimise
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
+from recon.report.forecast import Bar, Forecast
 from recon.run.checkpoint import Checkpoint, save, save_if_possible
-from recon.run.forecast import Bar, Forecast
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
 from recon.run.results import leave_interrupted

@@ -129,17 +129,9 @@ def write_results(
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
     prisms = config.acquisition.prisms
 
-    steps = [abs(b - a) for a, b in pairwise(measured.focus)]
-    step = steps[0] if steps else None
-
     def write_sections() -> None:
         if sections is not None:
-            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], step)
-
-    def write_images() -> None:
-        names = [f"{kind}, prism {p}" for p in range(len(prisms)) for kind in ("measured", "modelled")]
-        pairs = torch.stack([data, images.cpu()], 1).flatten(0, 1)
-        write_stack(out / IMAGES, pairs, measured.pixel_size, step, names=names)
+            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], _focus_step(measured))
 
     def draw_images() -> None:
         figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)
@@ -155,7 +147,7 @@ def write_results(
             lambda: write_json(out / METRICS, found),
             lambda: leave_resolved(config, out, *notes),
             write_sections,
-            write_images,
+            lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
             draw_images,
             lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
             draw_misfit,
@@ -174,6 +166,23 @@ def leave_interrupted(out: Path, problem: Problem, step: Step) -> Path:
     delta = problem.setup.within_field(step.delta).detach().cpu()
     _write_volume(path, delta, problem.setup.field, f"delta n, interrupted after step {step.number}")
     return path
+
+
+def _write_images(
+    path: Path,
+    data: Float[Tensor, "prism focus y x"],
+    images: Float[Tensor, "prism focus y x"],
+    measured: Measured,
+) -> None:
+    """Write the measured images beside the model's, two channels for each prism. Raises StackError."""
+    names = [f"{kind}, prism {prism}" for prism in range(len(data)) for kind in ("measured", "modelled")]
+    pairs = torch.stack([data, images], 1).flatten(0, 1)
+    write_stack(path, pairs, measured.pixel_size, _focus_step(measured), names=names)
+
+
+def _focus_step(measured: Measured) -> float | None:
+    """The distance in µm between the first two focus planes; None of a single one."""
+    return next((abs(b - a) for a, b in pairwise(measured.focus)), None)
 
 
 def _write_volume(path: Path, delta: Float[Tensor, "z y x"], grid: Grid, name: str = "delta n") -> None:
