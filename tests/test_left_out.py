@@ -82,7 +82,7 @@ def _fast(no_pictures):
 
 
 METHODS = [{"method": "newton"}, {"method": "adam"}, {"method": "linear"}, {"method": "opl"}]
-MISFITS = [{"misfit": "poisson"}, {"misfit": "robust"}]
+MISFITS = [pytest.param({"misfit": "poisson"}, marks=pytest.mark.slow, id="poisson"), {"misfit": "robust"}]
 
 
 @pytest.mark.parametrize("how", METHODS + MISFITS, ids=lambda how: next(iter(how.values())))

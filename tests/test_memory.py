@@ -63,7 +63,6 @@ SCENES = {
 BUDGETS = {"whole": AMPLE, "batches": 2_500_000, "least": 1}
 USUAL = ("projection", "wave-2")
 DEAR = (
-    "rays",
     "wave-colours",
     "projection-cubic",
     "projection-many-images",

@@ -135,7 +135,7 @@ MAJORANTS = {
     ("bounds", "majorant"),
     [
         pytest.param(bounds, majorant, id=f"{limits}-{name}", marks=() if (limits, name) in fast else pytest.mark.slow)
-        for fast in [{("free", "edges"), ("not below 0", "everything")}]
+        for fast in [{("not below 0", "everything")}]
         for limits, bounds in (("free", FREE), ("not below 0", Bounds()))
         for name, majorant in MAJORANTS.items()
     ],
