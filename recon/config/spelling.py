@@ -10,11 +10,16 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from recon.config.media import index_of
+
 # Keys of a prism that are angles in rad, each of which may be given in degrees.
 ANGLES = ("bias", "polariser", "axis", "wedge")
 
 # What is appended to an angle's key where it is in degrees.
 DEGREES = "_degrees"
+
+# The keys of a layer that name its media, and what each stands for.
+_OF_LAYERS = {"depth": "thickness", "medium": "index", "design": "design_index"}
 
 # Further keys of a table, beside the fields of its dataclass, by the dataclass's name.
 _OF_PRISMS = (*(f"{angle}{DEGREES}" for angle in ANGLES), "file", "channel")
@@ -24,6 +29,7 @@ FURTHER: dict[str, tuple[str, ...]] = {
     "Prism": _OF_PRISMS,
     "CompensatorSection": _OF_PRISMS,
     "WedgeSection": _OF_PRISMS,
+    "Layer": tuple(_OF_LAYERS),
 }
 
 # Sets of keys that exclude each other because they say the same, by the key of their table.
@@ -31,6 +37,7 @@ ALTERNATIVES: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
     "": ((("tolerance",), ("fidelity",)),),
     "volume": ((("spacing",), ("pixel_size", "slice_thickness")),),
     "data": ((("path",), ("paths",)),),
+    "microscope.objective.layer": tuple(((old,), (new,)) for new, old in _OF_LAYERS.items()),
 }
 
 # The name by which a list of prisms holds bright field, which has none.
@@ -49,6 +56,7 @@ def canonical(values: Mapping[str, Any]) -> Table:
     known = dict(values)
     if isinstance(known.get("volume"), dict):
         known["volume"] = _volume(known["volume"])
+    known = _with_layer(known)
     if isinstance(known.get("acquisition"), dict):
         known["acquisition"] = _acquisition(known["acquisition"])
         if isinstance(known["acquisition"].get("prisms"), list):
@@ -93,6 +101,24 @@ def _volume(section: Table) -> Table:
         raise ValueError(f"volume.pixel_size: {size!r} must be a number, or a pair (y, x)")
     given = (("slice_thickness", thickness), *(("pixel_size", side) for side in sides))
     return {**others, "spacing": [_number(value, f"volume.{key}") for key, value in given]}
+
+
+def _with_layer(values: Table) -> Table:
+    """The values with the layer of the objective by thickness and indices, if there is one."""
+    microscope = values.get("microscope")
+    objective = microscope.get("objective") if isinstance(microscope, dict) else None
+    layer = objective.get("layer") if isinstance(objective, dict) else None
+    if not isinstance(microscope, dict) or not isinstance(objective, dict) or not isinstance(layer, dict):
+        return values
+    changed, key = dict(layer), "microscope.objective.layer"
+    for new, old in _OF_LAYERS.items():
+        if new not in layer:
+            continue
+        if old in layer:
+            raise ValueError(f"{key}.{old} and {key}.{new} say the same: leave one out")
+        read = _number if new == "depth" else index_of
+        changed[old] = read(changed.pop(new), f"{key}.{new}")
+    return {**values, "microscope": {**microscope, "objective": {**objective, "layer": changed}}}
 
 
 def _acquisition(section: Table) -> Table:

@@ -65,8 +65,9 @@ class Normalisation:
         empty field below 1e-3) is stray light; it is subtracted and the expected empty field put in its place. None
         flattens integers and leaves floats as they are.
     scale: the pixel value, offset removed, of an empty bright field of which the objective stops no light; or
-        "background", which takes it from the background and the expected empty field. None is "background" for
-        integers and 1 for floats, which are relative to the empty bright field already.
+        "background", which takes it from the background and the expected empty field; an extinct prism then has the
+        scale of the others. None is "background" for integers and 1 for floats, which are relative to the empty bright
+        field already.
     offset: the camera's dark counts, in the file's unit, which are subtracted first.
     order: total degree of the polynomial that describes the background.
     """
@@ -155,9 +156,10 @@ def prepare(
         background to the images where the normalisation flattens.
 
     Raises StackError where the number of prisms, planes or pixels is not the expected one, no pixel size is known, the
-    scale should come from a background at extinction, or a background that divides the images is not above 0.
+    scale should come from backgrounds that are all extinct, or a background that divides the images is not above 0.
     Warns StackWarning where the file's sizes differ from the expected ones by more than 1 %, more than 1 % of the
-    pixels are saturated, or the background of floats isn't the expected one.
+    pixels are saturated, an extinct prism has the others' scale, the background of floats isn't the expected one, or
+    the empty field was recorded with another exposure.
     """
     normalisation = normalisation or Normalisation()
     _check_normalisation(stack, normalisation)
@@ -169,10 +171,13 @@ def prepare(
     if empty_field is not None:
         scale = "background" if normalisation.scale is None else normalisation.scale
         normalisation = replace(normalisation, flatten=True, scale=scale)
-    prepared = [
-        _in_model_unit(stack, prism, (bias, level), normalisation, left_out.counted, empty_field)
-        for prism, (bias, level) in enumerate(zip(expected.biases, levels, strict=True))
-    ]
+    found: dict[int, tuple[np.ndarray, PrismReport]] = {}
+    for prism in sorted(range(len(levels)), key=lambda prism: levels[prism] < _EXTINCT):  # which come last
+        dark, known = levels[prism] < _EXTINCT, [report.scale for _, report in found.values()]
+        how = _scaled_as(known, stack, prism, normalisation) if dark else normalisation
+        empty = expected.biases[prism], levels[prism]
+        found[prism] = _in_model_unit(stack, prism, empty, how, left_out.counted, empty_field)
+    prepared = [found[prism] for prism in range(len(levels))]
     reports = tuple(report for _, report in prepared)
     if not stack.is_integer and empty_field is None:
         _check_brightness(stack, reports, levels)
@@ -232,6 +237,20 @@ def _in_model_unit(
         noise=None if noise is None else math.hypot(noise, more) / unit,
     )
     return scaled, report
+
+
+def _scaled_as(scales: Sequence[float], stack: Stack, prism: int, normalisation: Normalisation) -> Normalisation:
+    """How an extinct prism is scaled where the background should tell: as the other prisms, whose scales are known."""
+    if not scales or normalisation.scale_of(stack) != "background":
+        return normalisation
+    scale = float(np.median(scales))
+    warnings.warn(
+        f"{stack.source}: prism {prism}'s empty field is dark and tells no scale: it is scaled as the other prisms, "
+        f"{scale:.4g} per empty bright field, which is right for one lamp and one exposure",
+        StackWarning,
+        stacklevel=3,
+    )
+    return replace(normalisation, scale=scale)
 
 
 def _of_exposure(
