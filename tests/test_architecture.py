@@ -170,10 +170,13 @@ def test_inverse_cannot_see_the_truth():
 
 
 def test_specimens_know_the_grid_and_no_more_of_torchdic():
-    """Their exact answers must not come from the models that they judge."""
+    """Their exact answers must not come from the models that they judge; a recorder's images must come from one."""
     specimens = modules("data_synthetic")
     assert offenders(specimens, lambda path: packages(path) & {"recon"}) == {}
-    assert offenders(specimens, lambda path: rooms_imported(path, "torchdic") - {"grid"}) == {}
+    exact = [path for path in specimens if room(path) != "recorder"]
+    assert offenders(exact, lambda path: rooms_imported(path, "torchdic") - {"grid"}) == {}
+    of_recorder = "data_synthetic.recorder"
+    assert offenders(exact, lambda path: [n for n in imported(path) if n.startswith(of_recorder)]) == {}
 
 
 def test_memory_knows_no_optics():

@@ -80,7 +80,7 @@ def draw_images(
                 _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
                 if p == 0:
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
-            _scale_bar(trio[0], grid.extent[2], "white")
+            scale_bar(trio[0], grid.extent[2], "white")
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
         figure.colorbar(axes[p, -1].images[0], ax=axes[p, -1], label="residual")
     return figure
@@ -127,7 +127,7 @@ def draw_sections(
             shown = _show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
             ax.set_ylabel(name[1], fontsize=8, labelpad=1)
-            _scale_bar(ax, size[name[0]], "white")
+            scale_bar(ax, size[name[0]], "white")
         column[0].set_title(title, fontsize=9)
     assert shown is not None
     figure.colorbar(shown, ax=axes, label="Δn")
@@ -171,7 +171,7 @@ def draw_stack(
         bar.set_label("intensity", fontsize=8)
         bar.ax.tick_params(labelsize=7)
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
-        _scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
+        scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
     return figure
 
 
@@ -196,7 +196,7 @@ def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: 
     return shown
 
 
-def _scale_bar(ax: Axes, width: float, colour: str) -> None:
+def scale_bar(ax: Axes, width: float, colour: str) -> None:
     """Add a bar of 1, 2 or 5 times a power of ten in µm, at most a quarter of the picture's width (µm) long."""
     power = 10.0 ** np.floor(np.log10(width / 4))
     length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)
