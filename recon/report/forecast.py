@@ -1,6 +1,8 @@
 """How long a descent will take: foreseen before its first step, and followed as its steps are taken."""
 
+from collections.abc import MutableMapping
 from statistics import mean
+from typing import Any
 
 from tqdm import tqdm
 
@@ -103,7 +105,7 @@ class Bar(tqdm):
         self.update()
 
     @property
-    def format_dict(self):
+    def format_dict(self) -> MutableMapping[str, Any]:
         """What the bar shows."""
-        known = self._left is not None
-        return super().format_dict | {"left": f"{self.format_interval(self._left)} left" if known else "time unknown"}
+        left = "time unknown" if self._left is None else f"{self.format_interval(self._left)} left"
+        return {**super().format_dict, "left": left}
