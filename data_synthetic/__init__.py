@@ -6,6 +6,8 @@ Every specimen is a frozen dataclass. Its lengths are in µm, and it knows the i
 Where an exact answer exists, the specimen knows it: the rays through a layered medium and a graded-index rod, the OPD
 of straight rays through a Gaussian ball, the OPD step of etched glass, and the wave field behind a bead or a ball of
 any smooth radial index. A reconstruction can therefore be tested on images that its own model has not made.
+
+`data_synthetic.recorder` records a specimen as a camera stores it, with the faults of real stacks and files.
 """
 
 from data_synthetic.ball import GaussianBall

@@ -1,7 +1,6 @@
 """Reading of configuration files, and errors in one line where a file can't be used."""
 
 import dataclasses
-import difflib
 import math
 import os
 import tomllib
@@ -15,6 +14,7 @@ from cattrs.errors import ForbiddenExtraKeysError
 from recon.config.conversion import converter
 from recon.config.encoding import decoded
 from recon.config.schema import Config, ConfigError, UnitsWarning
+from recon.config.spelling import FURTHER, canonical, unknown_key
 from recon.config.units import wrong_unit
 
 T = TypeVar("T")
@@ -36,6 +36,10 @@ def load(path: str | os.PathLike[str]) -> Config:
     wrong = wrong_unit(values)
     if wrong is not None:
         raise ConfigError(f"{path}: {wrong}")
+    try:
+        values = canonical(values)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: {error}") from error
     config = structure(values, Config, str(path))
     if config.data is not None:
         given = {"path": config.data.path, "mask": config.data.mask}
@@ -104,11 +108,10 @@ def _first_problem(error: Exception, where: str) -> str | None:
 def _describe(error: BaseException, _: Any) -> str:
     """An error in the words of the user's file, for cattrs, which adds " @ " and the key."""
     if isinstance(error, ForbiddenExtraKeysError):
-        name = min(error.extra_fields)
-        known = [f.name for f in dataclasses.fields(error.cl)]
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(known)}"
-        return f"unknown key {name}; {hint}"
+        further = FURTHER.get(error.cl.__name__, ())
+        name = min(error.extra_fields, key=lambda extra: (extra in further, extra))
+        known = [*(f.name for f in dataclasses.fields(error.cl)), *further]
+        return f"unknown key {name}; {unknown_key(name, known)}"
     if isinstance(error, KeyError):
         return "missing key"
     return str(error)

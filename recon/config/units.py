@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from recon.config.spelling import ANGLES, DEGREES
+
 # Factors to µm of the units in which lengths are given by mistake, in the order in which they are tried.
 _LENGTHS = {"nm": 1e-3, "m": 1e6, "mm": 1e3}
 
@@ -38,7 +40,8 @@ class _Plausible:
             size = abs(number)
             tiny = 0 < size < self.lowest and (self.each or largest < self.lowest)
             if tiny or size > self.highest:
-                return f"{key}{place}: {number:g} {self.unit} is no {self.what} {self._limits()}{self._meant(number)}"
+                meant = self._meant(number, key)
+                return f"{key}{place}: {number:g} {self.unit} is no {self.what} {self._limits()}{meant}"
         return None
 
     def _limits(self) -> str:
@@ -46,9 +49,13 @@ class _Plausible:
             return f"(at most {self.highest:g} {self.unit})"
         return f"({self.lowest:g} to {self.highest:g} {self.unit})"
 
-    def _meant(self, number: float) -> str:
+    def _meant(self, number: float, key: str) -> str:
+        if self.unit == "°":
+            return ""
         if self.unit == "rad":
-            return f"; angles are in rad: {number:g}° are {math.radians(number):.5g} rad"
+            last = key.rpartition(".")[2]
+            other = f", or {last}{DEGREES} = {number:g}" if last in ANGLES else ""
+            return f"; angles are in rad: {number:g}° are {math.radians(number):.5g} rad{other}"
         for unit, factor in _LENGTHS.items():
             if self.lowest <= abs(number) * factor <= self.highest:
                 return f"; lengths are in µm: {number:g} {unit} are {number * factor:.6g} µm"
@@ -65,9 +72,10 @@ _QUANTITIES = (
         20,
         each=True,
     ),
-    _Plausible(r"volume\.spacing", "size of a voxel", 1e-3, 100, each=True),
+    _Plausible(r"volume\.(spacing|slice_thickness)", "size of a voxel", 1e-3, 100, each=True),
     _Plausible(r"microscope\.camera\.pixel_size", "size of a pixel", 1e-3, 100),
-    _Plausible(rf"{_PRISM}shear", "shear", 1e-4, 20),
+    _Plausible(rf"{_PRISM}shear(\.length)?", "shear", 1e-4, 20),
+    _Plausible(rf"{_PRISM}({'|'.join(ANGLES)}|shear\.angle){DEGREES}", "angle of at most a turn", 0, 360, "°"),
     _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
     _Plausible(rf"{_PRISM}offset", "offset of a prism", 1e-4, 1e5),
     _Plausible(r"microscope\.objective\.layer\.thickness", "thickness of a layer", 1e-3, 1e4),
@@ -98,8 +106,8 @@ def wrong_unit(values: dict[str, Any]) -> str | None:
     known = dict(_numbers(values))
     quantities = (*_QUANTITIES, _focus(known), *_of_the_specimen(known))
     for key, numbers in known.items():
-        if key == "volume.spacing":
-            lateral = {place: number for place, number in numbers.items() if place in ("[1]", "[2]")}
+        if key in ("volume.spacing", "volume.pixel_size"):
+            lateral = {place: n for place, n in numbers.items() if key != "volume.spacing" or place in ("[1]", "[2]")}
             if lateral and (problem := _LATERAL.problem(key, lateral)):
                 return problem
         for quantity in quantities:
@@ -113,7 +121,7 @@ def _focus(known: dict[str, dict[str, float]]) -> _Plausible:
     wavelength, aperture = (known.get(f"microscope.{name}", {}).get("", 0) for name in ("wavelength", "objective.na"))
     field = wavelength / aperture**2 if wavelength > 0 and aperture > 0 else math.inf
     furthest = max(_BEYOND * max(_extent(known)[:1], default=0), 2 * _BEYOND * field, 50)
-    return _Plausible(r"acquisition\.focus", "focus in this volume", 1e-4, min(furthest, 1e4))
+    return _Plausible(r"acquisition\.focus(\.first|\.step)?", "focus in this volume", 1e-4, min(furthest, 1e4))
 
 
 def _of_the_specimen(known: dict[str, dict[str, float]]) -> list[_Plausible]:
@@ -126,10 +134,11 @@ def _of_the_specimen(known: dict[str, dict[str, float]]) -> list[_Plausible]:
 
 def _extent(known: dict[str, dict[str, float]]) -> list[float]:
     """The volume's size (z, y, x) in µm; an empty list where it has none."""
-    shape, spacing = (known.get(f"volume.{name}", {}) for name in ("shape", "spacing"))
-    if len(shape) != 3 or len(spacing) != 3:
-        return []
-    return [n * d for n, d in zip(shape.values(), spacing.values(), strict=True)]
+    shape, spacing, pixel, thickness = (
+        list(known.get(f"volume.{name}", {}).values()) for name in ("shape", "spacing", "pixel_size", "slice_thickness")
+    )
+    sides = spacing or [*thickness, *(pixel * 2)[:2]]
+    return [n * d for n, d in zip(shape, sides, strict=True)] if len(shape) == len(sides) == 3 else []
 
 
 def _numbers(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:

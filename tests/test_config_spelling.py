@@ -1,0 +1,146 @@
+"""Keys that people think in: each means exactly what the canonical one does, and never stands beside it."""
+
+import math
+import tomllib
+
+import pytest
+from refusal import the_error
+
+from recon.config import dump, load
+from recon.config.spelling import direction
+
+CANONICAL = {
+    "volume": "spacing = [0.3, 0.1, 0.1]",
+    "focus": "focus = [-2.0, -1.9, -1.8, -1.7]",
+    "shear": f"shear = [{0.18 * math.sin(math.radians(40))!r}, {0.18 * math.cos(math.radians(40))!r}]",
+    "bias": f"bias = {math.radians(70)!r}",
+}
+
+
+def text(**changed):
+    given = CANONICAL | changed
+    return (
+        f"[volume]\nshape = [4, 30, 30]\nbackground = 1.335\n{given['volume']}\n"
+        "[microscope]\nwavelength = 0.546\nobjective = { na = 0.9 }\n"
+        f"[acquisition]\n{given['focus']}\nprisms = [{{ {given['shear']}, {given['bias']} }}]\n"
+    )
+
+
+@pytest.fixture
+def write(tmp_path):
+    def put(content, name="config.toml"):
+        path = tmp_path / name
+        path.write_text(content, encoding="utf-8")
+        return path
+
+    return put
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"volume": "pixel_size = 0.1\nslice_thickness = 0.3"},
+        {"volume": "pixel_size = [0.1, 0.1]\nslice_thickness = 0.3"},
+        {"focus": "focus = { first = -2.0, step = 0.1, count = 4 }"},
+        {"shear": "shear = { length = 0.18, angle_degrees = 40 }"},
+        {"bias": "bias_degrees = 70"},
+    ],
+    ids=lambda given: next(iter(given)),
+)
+def test_another_spelling_resolves_to_the_very_same_configuration(write, given):
+    assert dump(load(write(text(**given)))) == dump(load(write(text())))
+
+
+def test_the_resolved_configuration_has_canonical_keys_alone(write):
+    other = {
+        "volume": "pixel_size = [0.1, 0.2]\nslice_thickness = 0.3",
+        "focus": "focus = { first = 1, step = -0.5, count = 3 }",
+        "shear": "shear = { length = 0.18, angle_degrees = 90 }",
+        "bias": "polariser_degrees = 22.5, axis_degrees = 45",
+    }
+    resolved = dump(load(write(text(**other))))
+    values = tomllib.loads(resolved)
+    assert values["volume"]["spacing"] == [0.3, 0.1, 0.2]
+    assert values["acquisition"]["focus"] == [1.0, 0.5, 0.0]
+    (prism,) = values["acquisition"]["prisms"]
+    assert prism == {"shear": [0.18, 0.0], "bias": math.radians(45), "axis": math.radians(45)}
+    assert dump(load(write(resolved, "again.toml"))) == resolved
+    assert "#" not in resolved
+
+
+@pytest.mark.parametrize(
+    ("degrees", "y", "x"), [(0, 0, 1), (90, 1, 0), (180, 0, -1), (-90, -1, 0), (45, 0.5**0.5, 0.5**0.5)]
+)
+def test_a_shears_angle_is_counted_from_right_to_downward(degrees, y, x):
+    assert direction(1.0, degrees) == pytest.approx((y, x), abs=1e-15)
+    assert direction(2.0, degrees) == pytest.approx((2 * y, 2 * x), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"volume": "spacing = [0.3, 0.1, 0.1]\npixel_size = 0.1"},
+            "volume.spacing and volume.pixel_size say the same: leave one out",
+        ),
+        (
+            {"bias": "bias = 1.2, bias_degrees = 70"},
+            "acquisition.prisms[0].bias and acquisition.prisms[0].bias_degrees say the same: leave one out",
+        ),
+        ({"volume": "pixel_size = 0.1"}, "missing key volume.slice_thickness, which goes with pixel_size"),
+        ({"volume": "slice_thickness = 0.1"}, "missing key volume.pixel_size, which goes with slice_thickness"),
+        (
+            {"volume": "pixel_siz = 0.1\nslice_thickness = 0.3"},
+            "unknown key volume.pixel_siz; did you mean 'pixel_size'?",
+        ),
+        ({"bias": "bias_degree = 70"}, "unknown key acquisition.prisms[0].bias_degree; did you mean 'bias_degrees'?"),
+        (
+            {"shear": "shear = { length = 0.2, angle = 40 }"},
+            "unknown key acquisition.prisms[0].shear.angle; did you mean 'angle_degrees'?",
+        ),
+        ({"shear": "shear = { length = 0.2 }"}, "missing key acquisition.prisms[0].shear.angle_degrees"),
+        ({"focus": "focus = { first = -2, step = 0.5 }"}, "missing key acquisition.focus.count"),
+        (
+            {"focus": "focus = { frist = -2, step = 0.5, count = 3 }"},
+            "unknown key acquisition.focus.frist; did you mean 'first'?",
+        ),
+        ({"focus": "focus = { first = -2, step = 0.5, count = 3.0 }"}, "acquisition.focus.count: 3.0 must be a whole"),
+        ({"focus": "focus = { first = -2, step = 0, count = 3 }"}, "acquisition.focus.step: 0 makes 3 planes one"),
+        ({"focus": "focus = { first = '-2', step = 0.5, count = 3 }"}, "acquisition.focus.first: '-2' must be a num"),
+        ({"bias": "bias_degrees = '70°'"}, "acquisition.prisms[0].bias_degrees: '70°' must be a number"),
+        ({"volume": "pixel_size = [0.1]\nslice_thickness = 0.3"}, "volume.pixel_size: [0.1] must be a number, or a"),
+    ],
+)
+def test_what_is_said_twice_half_or_wrongly_is_refused(write, given, message):
+    assert the_error(write(text(**given))).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("given", "named", "meant"),
+    [
+        ({"volume": "pixel_size = 100\nslice_thickness = 0.3"}, "volume.pixel_size: 100 µm", "100 nm are 0.1 µm"),
+        ({"volume": "pixel_size = 1e-7\nslice_thickness = 0.3"}, "volume.pixel_size: 1e-07 µm", "1e-07 m are 0.1 µm"),
+        ({"volume": "pixel_size = 0.1\nslice_thickness = 300"}, "volume.slice_thickness: 300 µm", "300 nm are 0.3 µm"),
+        (
+            {"focus": "focus = { first = -2000, step = 100, count = 3 }"},
+            "acquisition.focus.first: -2000 µm",
+            "-2000 nm are -2 µm",
+        ),
+        (
+            {"focus": "focus = { first = -2, step = 500, count = 3 }"},
+            "acquisition.focus.step: 500 µm",
+            "500 nm are 0.5 µm",
+        ),
+        (
+            {"shear": "shear = { length = 180, angle_degrees = 40 }"},
+            "acquisition.prisms[0].shear.length: 180 µm",
+            "180 nm are 0.18 µm",
+        ),
+        ({"bias": "bias = 70"}, "acquisition.prisms[0].bias: 70 rad", "or bias_degrees = 70"),
+        ({"bias": "bias_degrees = 4000"}, "acquisition.prisms[0].bias_degrees: 4000 °", "at most 360 °"),
+    ],
+)
+def test_another_unit_is_named_in_the_spelling_that_was_used(write, given, named, meant):
+    message = the_error(write(text(**given)))
+    assert named in message
+    assert meant in message
