@@ -75,12 +75,7 @@ class Beside:
 
     def fitted(self, setup: Setup) -> Step:
         """The last step of a fit. Raises ValueError where the light can't be followed."""
-        last = None
-        for last in coarse_steps(self.problem(setup), STEPS, SOURCES):
-            pass
-        if last is None:
-            raise ValueError("no volume can be fitted with these optics")
-        return last
+        return _last(self.problem(setup))
 
     def misfits(self, setup: Setup) -> np.ndarray:
         """The misfit of each image, relative to its prism's spatial variance, after a fit."""
@@ -131,12 +126,7 @@ def find_aperture(beside: Beside) -> Least:
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name."""
     problem = beside.problem(beside.setup)
-    learned = replace(problem, unknowns=[*problem.unknowns, Drift()])
-    last = None
-    for last in coarse_steps(learned, STEPS, SOURCES):
-        pass
-    if last is None:
-        raise ValueError("no volume can be fitted with these optics")
+    last = _last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
     index = next(u for u in problem.unknowns if u.name == "delta")
     unknowns = [Brightness(), Drift()]
     setup = index.put(last.values["delta"], beside.setup)
@@ -146,3 +136,10 @@ def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     nearby = Nearby(unknowns, parameters, setup, fidelity)
     values = {u.name: u.value(parameters[u.name]) for u in unknowns}
     return values, standard_deviations(nearby, parameters, problem.misfit)
+
+
+def _last(problem: Problem) -> Step:
+    steps = list(coarse_steps(problem, STEPS, SOURCES))
+    if not steps:
+        raise ValueError("no volume can be fitted with these optics")
+    return steps[-1]

@@ -45,8 +45,17 @@ ROUNDS = (16, 48, 112)
 # Depths at which the specimen is looked for, over the reach of the planes and of the volume.
 DEPTHS = 9
 
-# Δn (z, y, x), float32, of the specimen about the centre of a grid.
-KnownDelta = Callable[[Grid], Tensor]
+
+@dataclass(frozen=True)
+class KnownSpecimen:
+    """A specimen of known shape and index.
+
+    delta: its Δn (z, y, x) on a grid about whose centre it lies. height, width: along z and across it, µm.
+    """
+
+    delta: Callable[[Grid], Tensor]
+    height: float
+    width: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +74,12 @@ class OpticsFound:
     noise: float | None
 
 
-def model_of(part: Part, delta: KnownDelta, height: float, background: float, microscope: Microscope) -> Setup:
+def model_of(part: Part, specimen: KnownSpecimen, background: float, microscope: Microscope) -> Setup:
     """The specimen about the centre of a volume that is just as deep as it, in a field wider than the part's.
 
-    height: of the specimen along z, µm. A square pixel integrates over its area, as a camera's does.
-    The acquisition is a placeholder with bright field alone.
+    A square pixel integrates over its area, as a camera's does. The acquisition is bright field, to be replaced.
     """
+    height = specimen.height
     _, dy, dx = part.grid.spacing
     slabs = max(1, math.ceil(height / SLAB))
     margin = math.ceil(MARGIN * min(part.grid.shape[1:]))
@@ -78,7 +87,7 @@ def model_of(part: Part, delta: KnownDelta, height: float, background: float, mi
     wide = field.widened(margin, margin)
     camera = Camera(pixel_size=dx) if math.isclose(dy, dx) else None
     return Setup(
-        Volume(wide, delta(wide).to(part.data), background),
+        Volume(wide, specimen.delta(wide).to(part.data), background),
         replace(microscope, camera=camera),
         Acquisition(),
         margin=margin,

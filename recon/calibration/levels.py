@@ -1,8 +1,8 @@
-"""The biases behind the levels of the empty background: with one lamp and one exposure they are A·(sin²(bias/2) + leak).
+"""The biases behind the levels of the empty background: with one lamp and exposure they are A·(sin²(bias/2) + leak).
 
-The settings are those of one compensator, whose scale and zero may be off: bias = factor·declared + zero. Which of lamp,
-zero, factor and leak the levels tell depends on the settings: ±b tells the zero, a bright field the factor, and settings
-of several |b| both. What they don't tell keeps the width that it has beforehand.
+The settings are those of one compensator, whose scale and zero may be off: bias = factor·declared + zero. Which of
+lamp, zero, factor and leak the levels tell depends on the settings: ±b tells the zero, a bright field the factor, and
+settings of several |b| both. What they don't tell keeps the width that it has beforehand.
 """
 
 import math
@@ -22,11 +22,17 @@ UNSURE = math.radians(4)
 
 @dataclass(frozen=True)
 class BiasesFound:
-    """What the levels tell. biases, deviations: of each prism in rad, None for bright field. told: which are known."""
+    """What the levels tell.
+
+    biases, deviations: of each prism in rad, None for bright field. told: which of them are known. zero,
+    zero_deviation: of the compensator, rad. excess: see `biases_of_levels`.
+    """
 
     biases: tuple[float | None, ...]
     deviations: tuple[float | None, ...]
     told: tuple[bool, ...]
+    zero: float
+    zero_deviation: float
     excess: float
 
 
@@ -70,5 +76,7 @@ def biases_of_levels(
         tuple(None if b else float(v) for v, b in zip(biases, bright, strict=True)),
         tuple(None if b else float(v) for v, b in zip(wide, bright, strict=True)),
         tuple(bool(not b and w < UNSURE) for w, b in zip(wide, bright, strict=True)),
+        float(found.x[1]),
+        math.sqrt(float(covariance[1, 1])) * max(1.0, excess),
         excess,
     )

@@ -27,7 +27,7 @@ class Displacement(Drift):
 
 @dataclass(frozen=True)
 class ShearOfAxes(Nuisance):
-    """For each shear axis a factor on the shear's length and an angle in rad, from +x towards +y, by which it is turned.
+    """For each shear axis a factor on the length, and an angle in rad from +x towards +y by which it is turned.
 
     The value is (axis, 2), and the parameter the factor's logarithm and the angle. axes_of: of each prism its axis,
     counted from 0; of bright field any. learning_rate, step: of the logarithm, and in rad.
@@ -65,7 +65,10 @@ class ShearOfAxes(Nuisance):
 
 @dataclass(frozen=True)
 class FocusZero(Nuisance):
-    """What is to be added to all focus planes, 0-d in µm: where the specimen lies along z. learning_rate, step: in µm."""
+    """What is to be added to all focus planes, 0-d in µm: where the specimen lies along z.
+
+    learning_rate, step: in µm.
+    """
 
     learning_rate: float = 0.02
     step: float = 0.05

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from recon.calibration.declared import Otherwise, all_mistakes
+from recon.calibration.declared import Otherwise, all_mistakes, images_of
 from recon.calibration.short_fits import short_fit
 from recon.fit.problem import Problem
 from torchdic import Acquisition
@@ -61,29 +61,26 @@ class Orders:
         return "\n".join(lines)
 
 
-def find_orders(declared: Acquisition, problem_of: ProblemOf, seen: Callable[[int, int], None] | None = None) -> Orders:
+def find_orders(declared: Acquisition, problem_of: ProblemOf, noise: Sequence[float] | None) -> Orders:
     """Try all that `recon.calibration.declared` names.
 
-    declared: the whole stack's acquisition. problem_of: see `ProblemOf`. seen: is called after each fit with its number
-    in its round and the round's number of fits.
+    declared: the whole stack's acquisition. problem_of: see `ProblemOf`. noise: standard deviation of each prism's;
+    None where it isn't known.
     """
     racing: Sequence[Otherwise] = all_mistakes(declared)
-    found: dict[str, Tried] = {}
-    noise = 0.0
+    found: dict[object, Tried] = {}
+    alone = 0.0
     for number, (most, slices, steps, sources) in enumerate(ROUNDS, 1):
         if number > 1 and len(racing) > most:
             best = sorted(racing, key=lambda other: found[_key(other)].misfit)[:most]
             # the declared one stays in the race: it is what the others are compared with
             racing = best if any(o.mistakes == 0 for o in best) else [*best, *(o for o in racing if o.mistakes == 0)]
-        for index, other in enumerate(racing, 1):
+        for other in racing:
             problem = problem_of(other.acquisition, slices)
-            noise = problem.misfit.of_noise() or noise
-            misfit = short_fit(problem, steps, sources)
-            found[_key(other)] = Tried(other, misfit, number)
-            if seen is not None:
-                seen(index, len(racing))
+            alone = problem.misfit.of_noise(noise) or 0.0
+            found[_key(other)] = Tried(other, short_fit(problem, steps, sources), number)
     ranked = sorted(found.values(), key=lambda tried: (-tried.rounds, tried.misfit))
-    return _chosen(tuple(ranked), noise)
+    return _chosen(tuple(ranked), alone)
 
 
 def _chosen(ranked: tuple[Tried, ...], noise: float) -> Orders:
@@ -98,5 +95,5 @@ def _chosen(ranked: tuple[Tried, ...], noise: float) -> Orders:
     return Orders(ranked, noise, chosen.otherwise, told)
 
 
-def _key(other: Otherwise) -> str:
-    return other.what
+def _key(other: Otherwise) -> object:
+    return images_of(other.acquisition)

@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass, replace
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -14,7 +13,7 @@ from torchdic import Acquisition, Grid, Microscope
 from torchdic.scalar import number
 
 # Pixels along a side, planes and slices of a part at most.
-PIXELS, PLANES, SLICES = 64, 5, 12
+PIXELS, PLANES, SLICES = 56, 5, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +30,22 @@ class Part:
     corner: tuple[int, int]
     grid: Grid
 
-    def setup(self, background: float | Tensor, microscope: Microscope, acquisition: Acquisition) -> Setup:
-        """An empty volume before the part of an acquisition of the whole stack's planes."""
+    def sliced(self, slices: int) -> "Part":
+        """The same with so many slices at most."""
+        shape, spacing = self.grid.shape, self.grid.spacing
+        number_of = min(shape[0], slices)
+        return replace(self, grid=Grid((number_of, *shape[1:]), (self.grid.extent[0] / number_of, *spacing[1:])))
+
+    def setup(
+        self, background: float | Tensor, microscope: Microscope, acquisition: Acquisition, margin: int = 0
+    ) -> Setup:
+        """An empty volume before the part of an acquisition of the whole stack's planes.
+
+        margin: voxels by which it is wider than the part on each side.
+        """
         focus = [acquisition.focus[plane] for plane in self.planes]
-        medium = empty_medium(self.grid, number(background), self.data)
-        return Setup(medium, microscope, replace(acquisition, focus=focus))
+        medium = empty_medium(self.grid.widened(margin, margin), number(background), self.data)
+        return Setup(medium, microscope, replace(acquisition, focus=focus), margin=margin)
 
 
 def part_of(

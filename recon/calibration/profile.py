@@ -33,7 +33,7 @@ class Least:
 def least_misfit(
     misfits_at: MisfitsAt, first: float, step: float, noise: float, pixels: int, limits: tuple[float, float]
 ) -> Least:
-    """Find the value with the least misfit: three trials, moved until the least lies among them, then three closer ones.
+    """Find the value with the least misfit: three trials, moved until it lies among them, then three closer ones.
 
     first, step: the middle of the first trials, and their distance. noise: what noise leaves of the mean misfit.
     pixels: of all images. limits: the least and the greatest value.
