@@ -62,16 +62,16 @@ class CalibrationStack:
         part, recipe = self.part(slices=COARSE), Recipe(bounds=bounds, prior=self.config.reconstruction.prior)
         config, fidelity = self.config, Fidelity("wave")
 
-        def problem_of(acquisition: Acquisition, slices: int) -> Problem:
+        def problem_of(acquisition: Acquisition, slices: int, recipe: Recipe) -> Problem:
             some = part.sliced(slices)
             setup = some.setup(config.volume.background, config.microscope, acquisition)
             return Problem.from_recipe(
                 some.data, setup, fidelity, recipe, lambda data: GaussianMisfit(data, mask=some.mask), self.noise
             )
 
-        if not can_be_tried(problem_of(config.acquisition, COARSE)):
+        if not can_be_tried(problem_of(config.acquisition, COARSE, recipe)):
             return None
-        return find_orders(config.acquisition, problem_of, self.noise)
+        return find_orders(config.acquisition, problem_of, recipe, self.noise)
 
     def beside(self, planes: int = PLANES) -> Beside:
         """The part of the stack beside a volume that is fitted to it; the volume goes on where the specimen is cut."""
