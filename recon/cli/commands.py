@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
+from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
 from recon.cli.own_stack import new, phase
 from recon.config.schema import AssumedWarning, ConfigError
 from recon.report.terminal import write_plainly
@@ -59,6 +59,11 @@ COMMANDS = {
         "find the fastest way to compute images within a tolerance, and which effects matter",
         plan.run,
         (arguments.config, arguments.out_if_wanted, arguments.device),
+    ),
+    "calibrate": Command(
+        "find signs, orders and values of the optics, as far as the images of a stack tell them",
+        calibrate.run,
+        (arguments.config, arguments.out, arguments.device),
     ),
     "reconstruct": Command(
         "find the refractive-index volume behind a stack of DIC images",

@@ -17,6 +17,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.config.schema import (
+    CalibrationSection,
     CompensatorSection,
     Config,
     DataSection,
@@ -42,6 +43,16 @@ converter = cattrs.Converter(forbid_extra_keys=True)
 def dump(config: Config) -> str:
     """The whole configuration as TOML, with every default; what is absent by default is left out."""
     return tomli_w.dumps(_plain(config))
+
+
+def dump_microscope(config: Config) -> str:
+    """The microscope and the prisms as TOML, to be included by the configurations of other stacks."""
+    return tomli_w.dumps(
+        {
+            "microscope": _plain(config.microscope),
+            "acquisition": {"prisms": _plain(tuple(config.acquisition.prisms))},
+        }
+    )
 
 
 def flat(config: Config) -> list[str]:
@@ -249,6 +260,7 @@ FIELDS: dict[type, dict[str, Hook]] = {
         "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
         "margin": _or("auto", _whole_number),
     },
+    CalibrationSection: {"aberrations": _array_of(_whole_number)},
     WorkPrecisionSection: {
         **dict.fromkeys(("methods", "propagations"), _array_of(_string)),
         **dict.fromkeys(("directions", "planes"), _array_of(_whole_number)),

@@ -186,6 +186,52 @@ class ReconstructionSection(Recipe):
 
 
 @dataclass(frozen=True)
+class BeadSection:
+    """A bead of known size and index, of which the stack in [data] is.
+
+    radius: in µm. index: its refractive index.
+    Raises ValueError for a radius not above 0 and an index below 1.
+    """
+
+    radius: float
+    index: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius < math.inf):
+            raise ValueError(f"radius {self.radius} must be above 0")
+        if not (1 <= self.index < math.inf):
+            raise ValueError(f"index {self.index} must be a refractive index of at least 1")
+
+
+@dataclass(frozen=True)
+class CalibrationSection:
+    """How `torchdic calibrate` works.
+
+    bead: of which the stack is; None for a specimen that isn't known.
+    aberrations: Noll indices of the objective's Zernike terms that are sought with a bead.
+    one_exposure: whether all prism settings were recorded with one lamp, exposure and gain, so that the levels of their
+        backgrounds tell of their biases.
+    Raises ValueError for a Noll index below 4, which a picture doesn't show, or named twice, and for aberrations
+    without a bead.
+    """
+
+    bead: BeadSection | None = None
+    aberrations: tuple[int, ...] = ()
+    one_exposure: bool = False
+
+    def __post_init__(self) -> None:
+        for term in self.aberrations:
+            if term < 4:
+                raise ValueError(f"aberrations {term}: piston and tilts (Noll 1 to 3) don't show; 5 and above do")
+            if term == 4:
+                raise ValueError("aberrations 4: defocus is where the bead lies along z")
+        if len(set(self.aberrations)) < len(self.aberrations):
+            raise ValueError(f"aberrations {list(self.aberrations)} names one twice")
+        if self.aberrations and self.bead is None:
+            raise ValueError(f"aberrations {list(self.aberrations)} show beside a bead of known size: give bead too")
+
+
+@dataclass(frozen=True)
 class SimulationSection:
     """How to simulate.
 
@@ -241,14 +287,15 @@ class Config:
     volume, microscope, acquisition: the volume, the microscope, and what was recorded with it.
     data: the measured stack; None where there is none.
     fidelity: how carefully to compute; None lets the command choose.
-    reconstruction, simulation, work_precision: how the commands of these names work.
+    reconstruction, calibration, simulation, work_precision: how the commands of these names work.
     specimen: the kind and the measures of a known specimen, which `recon.cli` makes of it; None where there is none.
     tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
         `torchdic.planning.work_precision.ladder`.
     assumed: names of values that nobody has said, which a reconstruction warns of; see `torchdic new`.
     Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
-    no lens has, for a condenser of which no light enters the medium, and for an empty list of candidates.
+    no lens has, for a condenser of which no light enters the medium, for a bead of the medium's index, and for an empty
+    list of candidates.
     """
 
     volume: VolumeSection
@@ -257,6 +304,7 @@ class Config:
     data: DataSection | None = None
     fidelity: Fidelity | None = None
     reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
+    calibration: CalibrationSection = field(default_factory=CalibrationSection)
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None
     tolerance: float | None = None
@@ -271,5 +319,8 @@ class Config:
             if not (0 < self.tolerance < math.inf):
                 raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
         check_apertures(self.microscope, self.volume.background)
+        bead = self.calibration.bead
+        if bead is not None and bead.index == self.volume.background:
+            raise ValueError(f"calibration.bead.index {bead.index} is the medium's: such a bead doesn't show")
         if self.candidates is not None and len(self.candidates) == 0:
             raise ValueError("candidates must hold at least one; leave it out for the default ones")

@@ -95,7 +95,10 @@ _QUANTITIES = (
 # A pixel may be coarse, but not as coarse as a slice.
 _LATERAL = _Plausible("", "size of a pixel", 1e-3, 20, each=True)
 
-_OF_SPECIMENS = r"specimen\.(sigma|radius|centre|height|offset|surface|edge|period|bottom|axis|.*semi_axes|.*\.centre)"
+_OF_SPECIMENS = (
+    r"specimen\.(sigma|radius|centre|height|offset|surface|edge|period|bottom|axis|.*semi_axes|.*\.centre)"
+    r"|calibration\.bead\.radius"
+)
 
 
 def wrong_unit(values: dict[str, Any]) -> str | None:
