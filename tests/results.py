@@ -5,6 +5,7 @@ RESULTS = {
     "metrics.json",
     "log.csv",
     "config.resolved.toml",
+    "images.ome.tif",
     "images.png",
     "sections.png",
     "misfit.png",

@@ -6,11 +6,12 @@ import warnings
 import pytest
 import torch
 
+from recon.calibration.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
-from recon.report.causes import can_be_tried, seen_in_residual, tried, variants
+from recon.report.causes import seen_in_residual, tried, variants
 from recon.report.verdict import LIMIT, PoorFitWarning, Verdict, judged, leaves_too_much
 from recon.run.results import tell
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from recon.cli import arguments, demo, plan, reconstruct, simulate, work_precision
+from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
 from recon.cli.own_stack import new, phase
 from recon.config.schema import AssumedWarning, ConfigError
 from recon.report.terminal import write_plainly
@@ -17,7 +17,7 @@ from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
 from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
-from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -59,6 +59,11 @@ COMMANDS = {
         "find the fastest way to compute images within a tolerance, and which effects matter",
         plan.run,
         (arguments.config, arguments.out_if_wanted, arguments.device),
+    ),
+    "calibrate": Command(
+        "find signs, orders and values of the optics, as far as the images of a stack tell them",
+        calibrate.run,
+        (arguments.config, arguments.out, arguments.device),
     ),
     "reconstruct": Command(
         "find the refractive-index volume behind a stack of DIC images",
@@ -122,15 +127,17 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _show_each_warning_once() -> None:
-    """Show each warning once, as one line above the progress bar.
+    """Show each warning once, as one line above the progress bar; of each kind about images, the first.
 
-    Python's own rule "once" would show a warning again for each module that it comes from.
+    Python's own rule "once" would show a warning again for each module that it comes from. A descent's images change
+    from step to step, and with them the digits of a warning about them.
     """
-    shown: set[str] = set()
+    shown: set[object] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if str(message) not in shown:
-            shown.add(str(message))
+        kind = type(message) if isinstance(message, BatchWarning) else str(message)
+        if kind not in shown:
+            shown.add(kind)
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show

@@ -17,6 +17,7 @@ from cattrs.gen import make_dict_structure_fn, override
 from torch import Tensor
 
 from recon.config.schema import (
+    CalibrationSection,
     CompensatorSection,
     Config,
     DataSection,
@@ -24,10 +25,8 @@ from recon.config.schema import (
     WedgeSection,
     WorkPrecisionSection,
 )
+from recon.config.spelling import BRIGHT_FIELD
 from torchdic import Acquisition, Candidate, Condenser, JonesPupil, Layer, Objective, Polarisation, Prism, Spectrum
-
-# The name by which a list of prisms holds bright field, which has none.
-BRIGHT_FIELD = "brightfield"
 
 # TOML has no null. This word switches off what has a default.
 NONE = "none"
@@ -44,6 +43,16 @@ converter = cattrs.Converter(forbid_extra_keys=True)
 def dump(config: Config) -> str:
     """The whole configuration as TOML, with every default; what is absent by default is left out."""
     return tomli_w.dumps(_plain(config))
+
+
+def dump_microscope(config: Config) -> str:
+    """The microscope and the prisms as TOML, to be included by the configurations of other stacks."""
+    return tomli_w.dumps(
+        {
+            "microscope": _plain(config.microscope),
+            "acquisition": {"prisms": _plain(tuple(config.acquisition.prisms))},
+        }
+    )
 
 
 def flat(config: Config) -> list[str]:
@@ -240,13 +249,18 @@ FIELDS: dict[type, dict[str, Hook]] = {
     Condenser: {"points": _tensor, "weights": _tensor},
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _array_of(_number)),
     Acquisition: {"prisms": _array_of(_prism), "focus": _array_of(_number)},
-    DataSection: {"scale": _or("background", _number)},
+    DataSection: {
+        "scale": _or("background", _number),
+        "paths": _array_of(_string),
+        "channels": _array_of(_whole_number),
+    },
     ReconstructionSection: {
         "tv": _or("auto", _weights),
         "learn": _array_of(_string),
         "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
         "margin": _or("auto", _whole_number),
     },
+    CalibrationSection: {"aberrations": _array_of(_whole_number)},
     WorkPrecisionSection: {
         **dict.fromkeys(("methods", "propagations"), _array_of(_string)),
         **dict.fromkeys(("directions", "planes"), _array_of(_whole_number)),

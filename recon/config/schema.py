@@ -93,7 +93,10 @@ class WedgeSection:
 class DataSection:
     """The measured stack, and how it is brought to the model's unit; see `recon.recording.preparation.prepare`.
 
-    path: of the stack; a relative one starts from the configuration's folder.
+    path: of the stack, whose channels are the prisms; a relative one starts from the configuration's folder.
+    paths: instead of path, several files; their channels, one file after the other, are the prisms.
+    channels: which channel of the path each prism is, or which channel of each of the paths; counted from 0. None is
+        all of them in their order.
     flatten: whether each image is divided by its background; None does so for integer stacks only.
     scale: counts of an empty bright field, or "background" to find them from the images' background; None does so for
         integer stacks, and takes floats as relative to the empty bright field.
@@ -104,12 +107,15 @@ class DataSection:
     series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
         relative path starts from the configuration's folder. None is all pixels.
+    empty: an image or a stack of the empty field, by which the stack is divided in place of a fitted background, see
+        `recon.recording.empty_field`; a relative path starts from the configuration's folder. None is none.
     stuck: "auto" looks for pixels of the camera that are dead, hot or stuck at a value; None trusts them all.
-    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
-    or a series below 0.
+    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, an order, a
+    channel or a series below 0, both path and paths, channels that aren't as many as the paths, and an empty field
+    that nothing is to be divided by.
     """
 
-    path: str
+    path: str | None = None
     flatten: bool | None = None
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
@@ -119,8 +125,27 @@ class DataSection:
     series: int | None = None
     mask: str | None = None
     stuck: Literal["auto"] | None = "auto"
+    paths: tuple[str, ...] | None = None
+    channels: tuple[int, ...] | None = None
+    empty: str | None = None
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of the stack; empty where none is named."""
+        return self.paths or (() if self.path is None else (self.path,))
 
     def __post_init__(self) -> None:
+        if self.path is not None and self.paths is not None:
+            raise ValueError("path and paths say the same: leave one out")
+        if self.empty is not None and self.flatten is False:
+            raise ValueError("empty divides the images, flatten = false says not to: leave one out")
+        if self.paths == ():
+            raise ValueError("paths must hold at least one file")
+        if self.channels is not None:
+            if len(self.files) > 1 and len(self.channels) != len(self.files):
+                raise ValueError(f"channels {list(self.channels)} must be as many as the {len(self.files)} paths")
+            if not self.channels or min(self.channels) < 0:
+                raise ValueError(f"channels {list(self.channels)} must be at least one, each at least 0")
         if self.gain is not None and not (0 < self.gain < math.inf):
             raise ValueError(f"gain {self.gain} must be above 0")
         if not (0 <= self.read_noise < math.inf):
@@ -158,6 +183,52 @@ class ReconstructionSection(Recipe):
             raise ValueError(f"margin {self.margin} must be at least 0")
         if self.checkpoint_every < 1:
             raise ValueError(f"checkpoint_every {self.checkpoint_every} must be at least 1 step")
+
+
+@dataclass(frozen=True)
+class BeadSection:
+    """A bead of known size and index, of which the stack in [data] is.
+
+    radius: in µm. index: its refractive index.
+    Raises ValueError for a radius not above 0 and an index below 1.
+    """
+
+    radius: float
+    index: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.radius < math.inf):
+            raise ValueError(f"radius {self.radius} must be above 0")
+        if not (1 <= self.index < math.inf):
+            raise ValueError(f"index {self.index} must be a refractive index of at least 1")
+
+
+@dataclass(frozen=True)
+class CalibrationSection:
+    """How `torchdic calibrate` works.
+
+    bead: of which the stack is; None for a specimen that isn't known.
+    aberrations: Noll indices of the objective's Zernike terms that are sought with a bead.
+    one_exposure: whether all prism settings were recorded with one lamp, exposure and gain, so that the levels of their
+        backgrounds tell of their biases.
+    Raises ValueError for a Noll index below 4, which a picture doesn't show, or named twice, and for aberrations
+    without a bead.
+    """
+
+    bead: BeadSection | None = None
+    aberrations: tuple[int, ...] = ()
+    one_exposure: bool = False
+
+    def __post_init__(self) -> None:
+        for term in self.aberrations:
+            if term < 4:
+                raise ValueError(f"aberrations {term}: piston and tilts (Noll 1 to 3) don't show; 5 and above do")
+            if term == 4:
+                raise ValueError("aberrations 4: defocus is where the bead lies along z")
+        if len(set(self.aberrations)) < len(self.aberrations):
+            raise ValueError(f"aberrations {list(self.aberrations)} names one twice")
+        if self.aberrations and self.bead is None:
+            raise ValueError(f"aberrations {list(self.aberrations)} show beside a bead of known size: give bead too")
 
 
 @dataclass(frozen=True)
@@ -216,14 +287,15 @@ class Config:
     volume, microscope, acquisition: the volume, the microscope, and what was recorded with it.
     data: the measured stack; None where there is none.
     fidelity: how carefully to compute; None lets the command choose.
-    reconstruction, simulation, work_precision: how the commands of these names work.
+    reconstruction, calibration, simulation, work_precision: how the commands of these names work.
     specimen: the kind and the measures of a known specimen, which `recon.cli` makes of it; None where there is none.
     tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
         `torchdic.planning.work_precision.ladder`.
     assumed: names of values that nobody has said, which a reconstruction warns of; see `torchdic new`.
     Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
-    no lens has, for a condenser of which no light enters the medium, and for an empty list of candidates.
+    no lens has, for a condenser of which no light enters the medium, for a bead of the medium's index, and for an empty
+    list of candidates.
     """
 
     volume: VolumeSection
@@ -232,6 +304,7 @@ class Config:
     data: DataSection | None = None
     fidelity: Fidelity | None = None
     reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
+    calibration: CalibrationSection = field(default_factory=CalibrationSection)
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None
     tolerance: float | None = None
@@ -246,5 +319,8 @@ class Config:
             if not (0 < self.tolerance < math.inf):
                 raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
         check_apertures(self.microscope, self.volume.background)
+        bead = self.calibration.bead
+        if bead is not None and bead.index == self.volume.background:
+            raise ValueError(f"calibration.bead.index {bead.index} is the medium's: such a bead doesn't show")
         if self.candidates is not None and len(self.candidates) == 0:
             raise ValueError("candidates must hold at least one; leave it out for the default ones")

@@ -5,32 +5,21 @@ are tried: each is a descent of a few coarse steps beside one with what was decl
 is named first. Other mistakes show in the residual itself: in a few pixels, at the border, in one prism, in one image.
 """
 
-import contextlib
-import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from recon.calibration.declared import images_of, one_mistake
+from recon.calibration.short_fits import short_fit
 from recon.fit.bounds import Bounds, SupportedBounds
-from recon.fit.descent import minimise
-from recon.fit.newton.weak_hessian import check_linear_response
-from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.unknowns import IndexDifference
 from recon.misfit.base import Misfit
-from torchdic import Acquisition, Fidelity, Prism
-from torchdic.errors import SamplingWarning, SidewaysError, UnstableError, WrapAroundWarning
 from torchdic.scalar import number
-
-# Steps and condenser directions of a short fit. The benchmarks' cell has a misfit of 0.17 after them if all is right,
-# and of 0.57 to 0.76 where a sign, the order of the planes or the axes are wrong.
-STEPS, SOURCES = 3, 12
 
 # A change that explains less than LEAST of what is unexplained is no cause; after one that explains ENOUGH, no more is
 # tried.
@@ -38,9 +27,6 @@ LEAST, ENOUGH = 0.25, 0.9
 
 # The condenser's aperture is tried wider and narrower by this factor.
 APERTURE = 1.3
-
-# Two prisms exchanged are tried where there are at most so many of them.
-MOST_PRISMS = 4
 
 # Where FEW of the pixels hold more than HALF of the squared residual, and their neighbours less than ALONE of theirs,
 # the pixels are stuck.
@@ -178,15 +164,6 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
 # --- what short fits show ---------------------------------------------------------------------------------------------
 
 
-def can_be_tried(problem: Problem) -> bool:
-    """Whether short fits can be made: whether Newton's method can take its steps here."""
-    try:
-        check_linear_response(problem.setup.microscope, problem.setup.acquisition)
-    except ValueError:
-        return False
-    return True
-
-
 def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
     """The causes that explain the stack better in a short fit than what was declared does.
 
@@ -206,19 +183,6 @@ def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
             return
 
 
-def short_fit(problem: Problem) -> float:
-    """The misfit after a few coarse steps of Newton's; infinite where the light can't be followed."""
-    coarse = GivenFidelity(Fidelity("wave", sources=SOURCES), None)
-    least = math.inf
-    with warnings.catch_warnings(), contextlib.suppress(FloatingPointError, UnstableError, SidewaysError):
-        # what is warned of for a trial's aperture says nothing of the user's
-        for kind in (SamplingWarning, WrapAroundWarning):
-            warnings.simplefilter("ignore", kind)
-        for step in minimise(replace(problem, fidelity=coarse, steps=STEPS, method="newton")):
-            least = min(least, step.misfit)
-    return least
-
-
 def variants(problem: Problem) -> Iterator[Variant]:
     """The problem with each likely mistake undone, the likeliest first; those that change nothing are left out."""
     setup = problem.setup
@@ -229,67 +193,19 @@ def variants(problem: Problem) -> Iterator[Variant]:
             "order gives the same images"
         )
         yield Variant("Δn's sign", "Δn is on the other side of 0", advice, lower)
-    seen = [_images_of(setup.acquisition)]
-    for name, what, advice, acquisition in _acquisitions(setup.acquisition):
-        made = _images_of(acquisition)
+    seen = [images_of(setup.acquisition)]
+    for other in one_mistake(setup.acquisition):
+        made = images_of(other.acquisition)
         if made not in seen:
             seen.append(made)
-            yield Variant(name, what, advice, replace(problem, setup=replace(setup, acquisition=acquisition)))
+            changed = replace(problem, setup=replace(setup, acquisition=other.acquisition))
+            yield Variant(other.name, other.what, other.advice, changed)
     for na, changed in _apertures(setup):
         advice = f"check the condenser's aperture diaphragm and immersion (na {na:.2g} explains more)"
         yield Variant("condenser", f"the condenser's na is nearer to {na:.2g}", advice, replace(problem, setup=changed))
     if problem.priors and problem.weight is None:  # a weight that follows the noise isn't too strong
         advice = "lower reconstruction.tv and l1, or leave tv = 'auto'"
         yield Variant(PRIORS, "the priors are too strong", advice, replace(problem, priors=(), weight=None))
-
-
-def _acquisitions(declared: Acquisition) -> Iterator[tuple[str, str, str, Acquisition]]:
-    """What may have been recorded instead of what was declared."""
-
-    def sheared(y: int, x: int, exchanged: bool = False) -> Acquisition:
-        return Acquisition([_sheared(p, y, x, exchanged) for p in declared.prisms], declared.focus)
-
-    back = Acquisition(declared.prisms, [-number(f) for f in declared.focus])
-    yield (
-        "sign",
-        "the shear or the bias has the other sign",
-        "reverse the sign of every shear, or exchange the files of bias +b and −b",
-        sheared(-1, -1),
-    )
-    yield "focus", "the planes are in the other order", "reverse acquisition.focus: the stage's +z is −z", back
-    advice = "exchange y and x of every shear: [y, x]; or the prisms' files; or the images are transposed"
-    yield "axes", "the shears' axes are exchanged", advice, sheared(1, 1, exchanged=True)
-    for axis, signs in (("y", (-1, 1)), ("x", (1, -1))):
-        advice = f"reverse the sign of the shears' {axis}, or mirror the images in {axis}"
-        yield f"mirrored {axis}", f"the images are mirrored in {axis}", advice, sheared(*signs)
-    both = Acquisition(sheared(-1, -1).prisms, back.focus)
-    yield "sign and focus", "signs and planes are both reversed", "reverse every shear, and acquisition.focus", both
-    advice = "exchange y and x of every shear and reverse their signs; or turn the images"
-    yield "axes and sign", "the shears' axes are exchanged and reversed", advice, sheared(-1, -1, exchanged=True)
-    if len(declared.prisms) <= MOST_PRISMS:
-        for i, j in combinations(range(len(declared.prisms)), 2):
-            prisms = list(declared.prisms)
-            prisms[i], prisms[j] = prisms[j], prisms[i]
-            what, advice = f"prisms {i} and {j} (from 0) are exchanged", "exchange them in acquisition.prisms"
-            yield "prisms", what, advice, Acquisition(prisms, declared.focus)
-
-
-def _sheared(prism: Prism | None, y: int, x: int, exchanged: bool) -> Prism | None:
-    if prism is None:
-        return None
-    shear = (number(prism.shear[0]), number(prism.shear[1]))
-    first, second = shear[::-1] if exchanged else shear
-    return replace(prism, shear=(y * first, x * second))
-
-
-def _images_of(acquisition: Acquisition) -> tuple[object, ...]:
-    """What tells acquisitions apart. A prism of the other shear and bias is the same one, with its beams renamed."""
-    prisms = []
-    for prism in acquisition.prisms:
-        sign = 1 if prism is None or number(prism.bias) >= 0 else -1
-        values = () if prism is None else (*map(number, prism.shear), number(prism.bias))
-        prisms.append(tuple(sign * value + 0.0 for value in values))
-    return tuple(prisms), tuple(number(focus) for focus in acquisition.focus)
 
 
 def _of_the_other_sign(problem: Problem) -> Problem | None:

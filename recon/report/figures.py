@@ -21,6 +21,9 @@ DPI = 150
 # Focus planes that a picture of a whole stack shows at most.
 MOST_PLANES = 7
 
+# Parts of the pixels that are darker and brighter than the scale of grey: a few hot pixels don't decide it.
+OUTSIDE = 0.002
+
 # Mean width of a letter of 8 points.
 INCHES_PER_LETTER = 0.062
 
@@ -63,9 +66,9 @@ def draw_images(
     figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
     axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
     residual = measured - modelled
-    largest = float(residual[:, planes].abs().max())
+    _, largest = _limits(residual[:, planes].abs())
     for p, prism in enumerate(prisms):
-        grey = ("gray", (float(measured[p].min()), float(measured[p].max())))
+        grey = ("gray", _limits(measured[p]))
         kinds = {
             "measured": (measured, *grey),
             "modelled": (modelled, *grey),
@@ -159,7 +162,7 @@ def draw_stack(
     figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
     for p, prism in enumerate(prisms):
-        limits = float(stack[p].min()), float(stack[p].max())
+        limits = _limits(stack[p])
         for ax, f in zip(axes[p], planes, strict=True):
             _show(ax, stack[p, f], spacing, "gray", limits)
             if p == 0:
@@ -170,6 +173,12 @@ def draw_stack(
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
         scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
     return figure
+
+
+def _limits(images: Tensor) -> tuple[float, float]:
+    """The values between which images are shown: all but the OUTSIDE part of their pixels at either end."""
+    low, high = np.quantile(images.detach().cpu().numpy(), (OUTSIDE, 1 - OUTSIDE))
+    return float(low), float(high)
 
 
 def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: tuple[float, float]):

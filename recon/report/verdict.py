@@ -14,12 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from recon.calibration.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Row
 from recon.fit.unknowns import IndexDifference
 from recon.prior.weight import FALLING, whiteness
-from recon.report.causes import Cause, can_be_tried, ranked, seen_in_residual, tried
+from recon.report.causes import Cause, ranked, seen_in_residual, tried
 
 # Misfit over noise's above which a volume doesn't explain its stack, if LEAST of the specimen's contrast is unexplained
 # as well: without noise, voxels and directions leave some 0.05 %. Right fits of the benchmarks end at 0.99 to 1.05.

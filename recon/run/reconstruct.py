@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.config.conversion import flat
-from recon.config.schema import Config, ConfigError, SimulationSection
+from recon.config.schema import CalibrationSection, Config, ConfigError, SimulationSection
 from recon.earlier.direct import solved_directly
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.setup import Setup, empty_medium
@@ -125,7 +125,7 @@ def margin_of(config: Config, measured: Measured) -> int:
     section = config.reconstruction
     if section.margin != "auto":
         return section.margin
-    if section.method in DIRECT or min(config.volume.shape[1:]) < LEAST_FIELD:
+    if section.method in DIRECT or min(*config.volume.shape[1:], *measured.data.shape[2:]) < LEAST_FIELD:
         return 0
     scene = config.volume.grid, config.microscope, config.volume.background
     margin = needed_margin(measured.data, measured.noise, *scene)
@@ -140,6 +140,7 @@ def _identity(config: Config, measured: Measured, problem: Problem) -> str:
         config,
         data=None,  # what the descent sees of them is in their digest
         specimen=None,
+        calibration=CalibrationSection(),
         simulation=SimulationSection(),
         # with more steps it is the same one, prolonged
         reconstruction=replace(config.reconstruction, steps=None, checkpoint_every=1, support=None),

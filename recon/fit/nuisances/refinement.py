@@ -7,6 +7,7 @@ the last of them is then judged by images that are formed anew.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -80,25 +81,63 @@ def best_brightness(images: Float[Tensor, "prism focus y x"], misfit: Misfit) ->
     return torch.where(norm > 0, found, 1).to(images)
 
 
-def _gauss_newton(nearby: Nearby, parameters: Parameters, misfit: Misfit) -> tuple[Parameters, float]:
-    """The damped Gauss–Newton step of each parameter, and its longest entry in scales."""
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """How a misfit depends on all parameters' entries near a place, in their scales.
+
+    hessian: (entry, entry), as Gauss and Newton have it. slopes: the gradient, image by image (image, entry).
+    scatter: the sum over all pixels of the squares of their parts in the gradient (entry, entry), where it was asked
+    for. scale: of each entry.
+    """
+
+    hessian: Float[Tensor, "entry entry"]
+    slopes: Float[Tensor, "image entry"]
+    scatter: Float[Tensor, "entry entry"] | None
+    scale: Float[Tensor, " entry"]
+
+    @property
+    def damped(self) -> Float[Tensor, "entry entry"]:
+        """The Hessian with the damping of what the images say nothing of."""
+        return self.hessian + torch.diag(RELATIVE * self.hessian.diagonal() + ABSOLUTE)
+
+    def step(self) -> Float[Tensor, " entry"]:
+        """The damped step, in the entries' scales."""
+        return -torch.linalg.solve(self.damped, self.slopes.sum(0))
+
+
+@torch.no_grad()
+def normal_equations(
+    nearby: Nearby, parameters: Mapping[str, Tensor], misfit: Misfit, scattered: bool = False
+) -> NormalEquations:
+    """The normal equations at parameters near those of the nearby images; their entries in the order of its unknowns.
+
+    scattered: whether the scatter is asked for.
+    """
     model = nearby.recorded(parameters)
     columns = [_told_from_rounding(column, model) for column in nearby.jacobian(parameters)]
     with torch.enable_grad():
         leaf = model.clone().requires_grad_()
         (slope,) = torch.autograd.grad(misfit(leaf), leaf)
     curvature = misfit.curvature(model)
-    # per image: the products of its directions (prism, focus, direction, direction), and their slopes
-    products = [torch.stack([_sums(a * curvature, b) for b in columns], -1) for a in columns]
-    gram, slopes = torch.stack(products, -2), torch.stack([_sums(slope, a) for a in columns], -1)
-
     # from the parameters in their scales to the directions in their steps
     acting, scale = _acting(nearby.unknowns, parameters, (model.shape[0], model.shape[1]))
-    acting = acting * SCALE
-    hessian = acting.mT @ (gram @ acting.unflatten(0, gram.shape[:3])).flatten(0, 2)
-    damped = hessian + torch.diag(RELATIVE * hessian.diagonal() + ABSOLUTE)
-    step = -torch.linalg.solve(damped, acting.mT @ slopes.flatten())
-    parts = (step * scale).split([part.numel() for part in parameters.values()])
+    by_image = (acting * SCALE).unflatten(0, (*model.shape[:2], -1))
+
+    def of_entries(weight: Tensor) -> Tensor:
+        # per image: the products of its directions (prism, focus, direction, direction)
+        products = [torch.stack([_sums(a * weight, b) for b in columns], -1) for a in columns]
+        return (by_image.mT @ torch.stack(products, -2) @ by_image).sum((0, 1))
+
+    slopes = torch.stack([_sums(slope, a) for a in columns], -1)[..., None, :] @ by_image
+    scatter = of_entries(slope.square()) if scattered else None
+    return NormalEquations(of_entries(curvature), slopes.flatten(0, 2), scatter, scale)
+
+
+def _gauss_newton(nearby: Nearby, parameters: Parameters, misfit: Misfit) -> tuple[Parameters, float]:
+    """The damped Gauss–Newton step of each parameter, and its longest entry in scales."""
+    equations = normal_equations(nearby, parameters, misfit)
+    step = equations.step()
+    parts = (step * equations.scale).split([part.numel() for part in parameters.values()])
     shaped = {
         name: part.reshape(parameter.shape).to(parameter)
         for (name, parameter), part in zip(parameters.items(), parts, strict=True)

@@ -39,11 +39,11 @@ class ShearError(Nuisance):
 
     def put(self, value: Tensor, setup: Setup) -> Setup:
         """The setup with every shear stretched and turned."""
-        prisms = [None if prism is None else _turned(prism, value) for prism in setup.acquisition.prisms]
+        prisms = [None if prism is None else turned_prism(prism, value) for prism in setup.acquisition.prisms]
         return replace(setup, acquisition=replace(setup.acquisition, prisms=prisms))
 
 
-def _turned(prism: Prism, value: Tensor) -> Prism:
+def turned_prism(prism: Prism, value: Tensor) -> Prism:
     """The prism with its shear stretched by a factor and turned by an angle from +x towards +y."""
     factor, angle = value
     y, x = prism.shear

@@ -1,0 +1,1 @@
+"""What the images tell of the optics: signs and orders by short fits, and values with their uncertainties."""

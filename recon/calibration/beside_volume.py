@@ -1,0 +1,145 @@
+"""What an unknown specimen tells of the optics: values with which a volume that is fitted explains its images best.
+
+The direction of the shear and the condenser's aperture show so. The bias and the length of the shear don't: with other
+ones another Δn explains the images as well. Brightness and drift of each image show beside any volume.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.calibration.optics import CondenserAperture, ShearOfAxes, axes_of
+from recon.calibration.part import Part
+from recon.calibration.profile import Least, least_misfit
+from recon.calibration.short_fits import coarse_steps
+from recon.calibration.uncertainty import standard_deviations
+from recon.fit.nuisances.brightness import Brightness
+from recon.fit.nuisances.drift import Drift
+from recon.fit.nuisances.nearby import Nearby
+from recon.fit.nuisances.refinement import refined
+from recon.fit.problem import Problem, Recipe
+from recon.fit.setup import Setup
+from recon.fit.step import Step
+from recon.fit.unknowns import with_values
+from recon.misfit.gaussian import GaussianMisfit
+from torchdic import Fidelity
+
+# Steps and condenser directions of a fit.
+STEPS, SOURCES = 8, 18
+
+# Distance of the trials: of the shear's angle in rad, and of the logarithm of the condenser's NA.
+ANGLE, APERTURE = 0.12, 0.12
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A part of a stack, and how a volume is fitted to it.
+
+    setup: an empty volume before the part. recipe: how to fit. noise: standard deviation of each prism's.
+    """
+
+    part: Part
+    setup: Setup
+    recipe: Recipe
+    noise: Sequence[float]
+    weight: float | None = None
+
+    @property
+    def misfit(self) -> GaussianMisfit:
+        """Of the part's images."""
+        return GaussianMisfit(self.part.data, mask=self.part.mask)
+
+    @property
+    def alone(self) -> float:
+        """What noise leaves of the misfit."""
+        return self.misfit.of_noise(self.noise) or 0.0
+
+    def held(self) -> "Beside":
+        """The same with the priors' weight held at what it comes to now: trials differ by it else."""
+        weights = self.fitted(self.setup).weights
+        return self if not weights else replace(self, weight=float(weights[-1]["tv"]))
+
+    def problem(self, setup: Setup) -> Problem:
+        """The fit of a volume with these optics."""
+        recipe = self.recipe
+        if self.weight is not None:
+            sparse = recipe.sparse if recipe.tv == "auto" else 0.25
+            recipe = replace(recipe, tv=(self.weight, self.weight), l1=sparse * self.weight)
+        fidelity, mask = Fidelity("wave", sources=SOURCES), self.part.mask
+        return Problem.from_recipe(
+            self.part.data, setup, fidelity, recipe, lambda data: GaussianMisfit(data, mask=mask), list(self.noise)
+        )
+
+    def fitted(self, setup: Setup) -> Step:
+        """The last step of a fit. Raises ValueError where the light can't be followed."""
+        return _last(self.problem(setup))
+
+    def misfits(self, setup: Setup) -> np.ndarray:
+        """The misfit of each image, relative to its prism's spatial variance, after a fit."""
+        problem = self.problem(setup)
+        last = self.fitted(setup)
+        with torch.no_grad():
+            images = with_values(problem.unknowns, last.values, setup).images(Fidelity("wave", sources=SOURCES))
+        misfit = problem.misfit
+        squares = misfit.where_counted((images - misfit.data).square()) / misfit.variance
+        return squares.mean((2, 3)).flatten().double().numpy()
+
+    def least(self, changed: Callable[[float], Setup], step: float, limits: tuple[float, float]) -> Least:
+        """The change of the optics, 0 as declared, with the least misfit."""
+        counted = int(self.misfit.pixels.sum())
+        return least_misfit(lambda value: self.misfits(changed(value)), 0.0, step, self.alone, counted, limits)
+
+
+def find_angles(beside: Beside) -> list[Least]:
+    """By how much the shear of each axis is turned from +x towards +y, rad; one axis after the other."""
+    axes = axes_of(beside.setup.acquisition)
+    unknown = ShearOfAxes(axes)
+    turned = torch.zeros(max(axes) + 1, 2, dtype=torch.float64)
+    found = []
+    for axis in range(max(axes) + 1):
+
+        def changed(angle: float, axis: int = axis) -> Setup:
+            entries = turned.clone()
+            entries[axis, 1] = angle
+            return unknown.put(unknown.of_entries(entries), beside.setup)
+
+        found.append(beside.least(changed, ANGLE, (-0.8, 0.8)))
+        turned[axis, 1] = found[-1].value
+    return found
+
+
+def find_aperture(beside: Beside) -> Least:
+    """The logarithm of the condenser's NA over the declared one."""
+    condenser = beside.setup.microscope.condenser
+    assert condenser is not None
+    unknown = CondenserAperture(float(beside.setup.volume.background))
+
+    def changed(logarithm: float) -> Setup:
+        return unknown.put(torch.tensor(logarithm, dtype=torch.float64).exp(), beside.setup)
+
+    return beside.least(changed, APERTURE, (-1.0, 0.7))
+
+
+def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name."""
+    problem = beside.problem(beside.setup)
+    last = _last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
+    index = next(u for u in problem.unknowns if u.name == "delta")
+    unknowns = [Brightness(), Drift()]
+    setup = index.put(last.values["delta"], beside.setup)
+    parameters = {"brightness": last.values["brightness"].log(), "drift": last.values["drift"]}
+    fidelity = Fidelity("wave", sources=SOURCES)
+    parameters = refined(unknowns, parameters, setup, problem.misfit, fidelity)
+    nearby = Nearby(unknowns, parameters, setup, fidelity)
+    values = {u.name: u.value(parameters[u.name]) for u in unknowns}
+    return values, standard_deviations(nearby, parameters, problem.misfit)
+
+
+def _last(problem: Problem) -> Step:
+    steps = list(coarse_steps(problem, STEPS, SOURCES))
+    if not steps:
+        raise ValueError("no volume can be fitted with these optics")
+    return steps[-1]

@@ -1,0 +1,174 @@
+"""The optics behind a stack of a specimen of known shape and index, such as a bead.
+
+Where the specimen lies is fitted together with the optics, by Gauss and Newton, on the model's own images of it. The
+volume is known, so that shear, bias and apertures are, too: nothing else can explain the contrast.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.calibration.optics import (
+    Aberrations,
+    CondenserAperture,
+    Displacement,
+    FocusZero,
+    ShearOfAxes,
+    axes_of,
+)
+from recon.calibration.part import Part
+from recon.calibration.uncertainty import standard_deviations
+from recon.fit.nuisances.base import Nuisance
+from recon.fit.nuisances.bias import Bias
+from recon.fit.nuisances.brightness import Brightness
+from recon.fit.nuisances.nearby import Nearby, formed_together
+from recon.fit.nuisances.refinement import refined
+from recon.fit.setup import Setup
+from recon.fit.unknowns import with_values
+from recon.misfit.base import Misfit
+from recon.misfit.gaussian import GaussianMisfit
+from torchdic import Acquisition, Camera, Fidelity, Grid, Microscope, Volume
+from torchdic.errors import SamplingWarning, WrapAroundWarning
+from torchdic.scalar import number
+
+# Thickness of a slab in µm, and the part of the field's width by which the model's is wider on each side.
+SLAB, MARGIN = 0.2, 0.2
+
+# Condenser directions of each round of steps; the last ones are the careful ones.
+ROUNDS = (16, 48, 112)
+
+# Depths at which the specimen is looked for, over the reach of the planes and of the volume.
+DEPTHS = 9
+
+
+@dataclass(frozen=True)
+class KnownSpecimen:
+    """A specimen of known shape and index.
+
+    delta: its Δn (z, y, x) on a grid about whose centre it lies. height, width: along z and across it, µm.
+    """
+
+    delta: Callable[[Grid], Tensor]
+    height: float
+    width: float
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsFound:
+    """What a known specimen tells.
+
+    values: by the unknown's name. parameters, deviations: their parameters, and one standard deviation of these.
+    setup: with all values in it. misfit: of its images. noise: what noise leaves of it; None where that isn't known.
+    """
+
+    values: dict[str, Tensor]
+    parameters: dict[str, Tensor]
+    deviations: dict[str, Tensor]
+    setup: Setup
+    misfit: float
+    noise: float | None
+
+
+def model_of(part: Part, specimen: KnownSpecimen, background: float, microscope: Microscope) -> Setup:
+    """The specimen about the centre of a volume that is just as deep as it, in a field wider than the part's.
+
+    A square pixel integrates over its area, as a camera's does. The acquisition is bright field, to be replaced.
+    """
+    height = specimen.height
+    _, dy, dx = part.grid.spacing
+    slabs = max(1, math.ceil(height / SLAB))
+    margin = math.ceil(MARGIN * min(part.grid.shape[1:]))
+    field = Grid((slabs, *part.grid.shape[1:]), (height / slabs, dy, dx))
+    wide = field.widened(margin, margin)
+    camera = Camera(pixel_size=dx) if math.isclose(dy, dx) else None
+    return Setup(
+        Volume(wide, specimen.delta(wide).to(part.data), background),
+        replace(microscope, camera=camera),
+        Acquisition(),
+        margin=margin,
+    )
+
+
+def find_optics(
+    part: Part, model: Setup, declared: Acquisition, noise: Sequence[float] | None, zernike: Sequence[int] = ()
+) -> OpticsFound:
+    """Find bias, shear, condenser aperture, place and brightness, and aberrations, of a known specimen's images.
+
+    part: of the stack. model: see `model_of`. declared: the whole stack's acquisition, its signs and orders right.
+    noise: standard deviation of each prism's. zernike: Noll indices of the aberrations that are sought.
+    Raises ValueError where all images are bright field, or the specimen isn't found.
+    """
+    acquisition = replace(declared, focus=[number(declared.focus[plane]) for plane in part.planes])
+    setup = replace(model, acquisition=acquisition)
+    misfit = GaussianMisfit(part.data, mask=part.mask)
+    unknowns = _unknowns(setup)
+    with warnings.catch_warnings():
+        for kind in (SamplingWarning, WrapAroundWarning):
+            warnings.simplefilter("ignore", kind)
+        parameters = {u.name: u.start(setup, misfit) for u in unknowns}
+        parameters |= _placed(setup, misfit, ROUNDS[0])
+        for number_of, sources in enumerate(ROUNDS):
+            if zernike and number_of == len(ROUNDS) - 2:
+                unknowns.append(Aberrations(tuple(zernike)))
+                parameters[unknowns[-1].name] = unknowns[-1].start(setup, misfit)
+            parameters = refined(unknowns, parameters, setup, misfit, Fidelity("wave", sources=sources))
+        nearby = Nearby(unknowns, parameters, setup, Fidelity("wave", sources=ROUNDS[-1]))
+        deviations = standard_deviations(nearby, parameters, misfit)
+    values = {u.name: u.value(parameters[u.name]) for u in unknowns}
+    return OpticsFound(
+        values,
+        parameters,
+        deviations,
+        with_values(unknowns, values, setup),
+        float(misfit(nearby.recorded(parameters))),
+        misfit.of_noise(noise),
+    )
+
+
+def _unknowns(setup: Setup) -> list[Nuisance]:
+    found: list[Nuisance] = [Brightness(), Displacement(), FocusZero(), Bias(), ShearOfAxes(axes_of(setup.acquisition))]
+    condenser = setup.microscope.condenser
+    if condenser is not None and number(condenser.na) > 0 and condenser.points is None:
+        found.append(CondenserAperture(number(setup.volume.background)))
+    return found
+
+
+def _placed(setup: Setup, misfit: Misfit, sources: int) -> dict[str, Tensor]:
+    """The displacement and the focus zero with which the model's images correlate best with the data."""
+    focus = [number(depth) for depth in setup.acquisition.focus]
+    reach = (max(focus) - min(focus)) / 2 + setup.volume.grid.extent[0] / 2
+    middle = (max(focus) + min(focus)) / 2
+    zeros = [float(z) - middle for z in torch.linspace(-reach, reach, DEPTHS)] if len(focus) > 1 else [-middle]
+    tried = [replace(setup, acquisition=replace(setup.acquisition, focus=[f + z for f in focus])) for z in zeros]
+    formed = formed_together(tried, Fidelity("wave", sources=sources), planes=True)
+    best, found = 0.0, None
+    for zero, images in zip(zeros, formed, strict=True):
+        score, shift = _correlation(setup.recorded(images), misfit, setup.volume.grid.spacing[1:])
+        if score > best:
+            best, found = score, (zero, shift)
+    if found is None:
+        raise ValueError("the specimen isn't in the images: nowhere do they correlate with those of the model")
+    zero, shift = found
+    data = misfit.data
+    return {
+        FocusZero.name: data.new_tensor(zero),
+        Displacement.name: data.new_tensor(shift).expand(*data.shape[:2], 2).clone(),
+    }
+
+
+def _correlation(
+    images: Float[Tensor, "prism focus y x"], misfit: Misfit, spacing: tuple[float, float]
+) -> tuple[float, tuple[float, float]]:
+    """The largest correlation of images with the data at any displacement, and that displacement (y, x) in µm."""
+    weight = misfit.variance.rsqrt()
+    model, data = ((i - i.mean((2, 3), keepdim=True)) * weight for i in (images, misfit.data))
+    spectrum = (torch.fft.rfft2(data) * torch.fft.rfft2(model).conj()).sum((0, 1))
+    correlation = torch.fft.irfft2(spectrum, s=data.shape[2:])
+    place = divmod(int(correlation.argmax()), data.shape[3])
+    shift = [(i if i <= n // 2 else i - n) * d for i, n, d in zip(place, data.shape[2:], spacing, strict=True)]
+    return float(correlation.max() / model.norm().clamp_min(1e-30)), (shift[0], shift[1])

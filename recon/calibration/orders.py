@@ -1,0 +1,123 @@
+"""Signs and orders: which of all descriptions of a stack explains it, by short fits in rounds.
+
+All are tried coarsely, and the best of them more and more carefully, as a race. Each fit is a volume of its own within
+the bounds of Δn, so that a sign of Δn that is known tells the sign of the shear.
+
+With weak priors a wrong description explains the images too, by a wild volume. So from the second round on the priors
+have one weight, that at which the best volume so far leaves the noise, and what is compared is misfit and priors.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from recon.calibration.declared import Otherwise, all_mistakes, images_of
+from recon.calibration.short_fits import coarse_steps
+from recon.fit.problem import Problem, Recipe
+from recon.fit.step import Step
+from torchdic import Acquisition
+
+# Of each round: how many descriptions are tried at most, the slices of their volumes, steps and condenser directions.
+ROUNDS = ((10_000, 10, 2, 8), (4, 12, 6, 12), (2, 20, 8, 18))
+
+# A description is preferred to the declared one only where it lowers what that leaves by this share, the noise left
+# out: a wrong sign, order or axis leaves far more.
+LEAST = 0.05
+
+# Makes the problem of an acquisition of the whole stack, with so many slices, by a recipe.
+ProblemOf = Callable[[Acquisition, int, Recipe], Problem]
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """A description and its last short fit.
+
+    misfit: of its volume. loss: with the priors. rounds: how many it was in.
+    """
+
+    otherwise: Otherwise
+    misfit: float
+    loss: float
+    rounds: int
+
+
+@dataclass(frozen=True, eq=False)
+class Orders:
+    """What the short fits say.
+
+    tried: all descriptions, the best first: those of the last round, then those of the one before it. noise: what noise
+    leaves of the misfit. chosen: the one to go by. told: whether the images tell it from the next best.
+    """
+
+    tried: tuple[Tried, ...]
+    noise: float
+    chosen: Otherwise
+    told: bool
+
+    def table(self, most: int = 8) -> str:
+        """The best descriptions and their misfits over the noise's, as a table; `most` rows."""
+        shown = self.tried[:most]
+        width = max(len(tried.otherwise.name) for tried in shown)
+        unit = "misfit / noise" if self.noise > 0 else "misfit"
+        lines = [f"{'what would be wrong':{max(width, 19)}}  {unit:>14}  {'with priors':>11}  rounds"]
+        for tried in shown:
+            value, loss = (part / (self.noise or 1.0) for part in (tried.misfit, tried.loss))
+            mark = "  ←" if tried.otherwise is self.chosen else ""
+            lines.append(f"{tried.otherwise.name:{max(width, 19)}}  {value:14.3f}  {loss:11.3f}  {tried.rounds}{mark}")
+        if len(self.tried) > most:
+            lines.append(f"and {len(self.tried) - most} others, which explain less")
+        return "\n".join(lines)
+
+
+def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, noise: Sequence[float] | None) -> Orders:
+    """Try all that `recon.calibration.declared` names.
+
+    declared: the whole stack's acquisition. problem_of: see `ProblemOf`. recipe: with bounds and a prior.
+    noise: standard deviation of each prism's; None where it isn't known.
+    """
+    racing: Sequence[Otherwise] = all_mistakes(declared)
+    found: dict[object, Tried] = {}
+    alone = 0.0
+    for number, (most, slices, steps, sources) in enumerate(ROUNDS, 1):
+        if number > 1:
+            best = sorted(racing, key=lambda other: found[_key(other)].loss)[:most]
+            # the declared one stays in the race: it is what the others are compared with
+            racing = best if any(o.mistakes == 0 for o in best) else [*best, *(o for o in racing if o.mistakes == 0)]
+            recipe = _held(recipe, _last(problem_of(racing[0].acquisition, slices, recipe), steps, sources))
+        for other in racing:
+            problem = problem_of(other.acquisition, slices, recipe)
+            alone = problem.misfit.of_noise(noise) or 0.0
+            last = _last(problem, steps, sources)
+            misfit, loss = (math.inf, math.inf) if last is None else (last.misfit, last.loss)
+            found[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)
+    ranked = sorted(found.values(), key=lambda tried: (-tried.rounds, tried.loss))
+    return _chosen(tuple(ranked), alone)
+
+
+def _last(problem: Problem, steps: int, sources: int) -> Step | None:
+    last = list(coarse_steps(problem, steps, sources))
+    return last[-1] if last else None
+
+
+def _held(recipe: Recipe, last: Step | None) -> Recipe:
+    """The recipe with the priors' weight held at what it came to; as it is where that isn't known."""
+    if recipe.tv != "auto" or last is None or not last.weights:
+        return recipe
+    weight = float(last.weights[-1]["tv"])
+    return replace(recipe, tv=(weight, weight), l1=recipe.sparse * weight)
+
+
+def _chosen(ranked: tuple[Tried, ...], noise: float) -> Orders:
+    last = [tried for tried in ranked if tried.rounds == len(ROUNDS)]
+    declared = next(tried for tried in last if tried.otherwise.mistakes == 0)
+    best = last[0]
+    gained = (declared.loss - best.loss) / max(declared.loss - noise, 1e-12)
+    chosen = best if gained > LEAST else declared
+    others = [tried for tried in last if tried is not chosen]
+    nearest = min((tried.loss for tried in others), default=math.inf)
+    told = nearest == math.inf or (nearest - chosen.loss) > LEAST * max(nearest - noise, 1e-12)
+    return Orders(ranked, noise, chosen.otherwise, told)
+
+
+def _key(other: Otherwise) -> object:
+    return images_of(other.acquisition)

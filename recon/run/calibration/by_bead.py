@@ -1,0 +1,146 @@
+"""Values from a stack of a bead of known size and index."""
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from recon.calibration.known_specimen import KnownSpecimen, OpticsFound, find_optics, model_of
+from recon.calibration.optics import axes_of
+from recon.config.schema import BeadSection, Config, ConfigError
+from recon.run.calibration.found import FoundQuantity, Value, plain
+from recon.run.calibration.stack import CalibrationStack
+from torchdic import Acquisition, Prism
+from torchdic.scalar import number
+
+# Planes of the stack, and µm of light around the bead on each side, that its fit takes.
+PLANES, AROUND = 7, 3.5
+
+# A fit that leaves more than this many times the noise's misfit, and this share of the contrast, isn't explained.
+POOR, LEAST = 1.5, 0.02
+
+
+def by_bead(
+    stack: CalibrationStack, bead: KnownSpecimen, section: BeadSection
+) -> tuple[CalibrationStack, list[FoundQuantity]]:
+    """The stack with what its bead tells of the optics, and each quantity.
+
+    Raises ConfigError where the field is no larger than the bead, or the bead isn't found in it.
+    """
+    config = stack.config
+    pixel = min(config.volume.spacing[1:])
+    extent = min(config.volume.grid.extent[1:])
+    if extent < 1.2 * bead.width:
+        raise ConfigError(
+            f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
+            "the images must show the bead and some of the medium around it"
+        )
+    part = stack.part(math.ceil((bead.width + 2 * AROUND) / pixel), PLANES)
+    model = model_of(part, bead, config.volume.background, config.microscope)
+    print(f"the optics behind the bead, by {part.data.shape[0]} × {part.data.shape[1]} of its images …", flush=True)
+    try:
+        found = find_optics(part, model, config.acquisition, stack.noise, config.calibration.aberrations)
+    except ValueError as error:
+        raise ConfigError(f"calibration.bead: {error}") from error
+    return stack.with_config(_calibrated(config, found)), _quantities(config, found, part.planes)
+
+
+def _calibrated(config: Config, found: OpticsFound) -> Config:
+    """The configuration with the optics that were found."""
+    acquisition, microscope = found.setup.acquisition, found.setup.microscope
+    prisms = [None if prism is None else _plain_prism(prism) for prism in acquisition.prisms]
+    condenser, objective = config.microscope.condenser, config.microscope.objective
+    if condenser is not None and microscope.condenser is not None and condenser.points is None:
+        inner = microscope.condenser.inner_na
+        condenser = replace(
+            condenser,
+            na=float(f"{microscope.condenser.na:.5g}"),
+            inner_na=None if inner is None else float(f"{inner:.5g}"),
+        )
+    if objective is not None and microscope.objective is not None and microscope.objective.aberrations:
+        terms = {term: float(f"{number(v):.4g}") for term, v in microscope.objective.aberrations.items()}
+        objective = replace(objective, aberrations=terms)
+    return replace(
+        config,
+        acquisition=Acquisition(prisms, config.acquisition.focus),
+        microscope=replace(config.microscope, condenser=condenser, objective=objective),
+    )
+
+
+def _plain_prism(prism: Prism) -> Prism:
+    y, x = (float(f"{number(component):.5g}") for component in prism.shear)
+    axis = None if prism.axis is None else float(f"{number(prism.axis):.5g}")
+    return Prism((y, x), float(f"{number(prism.bias):.5g}"), axis)
+
+
+def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> list[FoundQuantity]:
+    """Each quantity that a bead tells."""
+    how = _how(found)
+    declared = config.acquisition.prisms
+    sheared = [i for i, prism in enumerate(declared) if prism is not None]
+    biases = [number(prism.bias) for prism in declared if prism is not None]
+    made = [_of("bias", "rad", biases, found.values["bias"][sheared], found.deviations["bias"][sheared], how)]
+    made += _shears(config, found, how)
+    if "condenser" in found.values:
+        assert config.microscope.condenser is not None
+        before = number(config.microscope.condenser.na)
+        na, sure = (before * found.values["condenser"] * part for part in (1.0, found.deviations["condenser"]))
+        made.append(_of("condenser na", "", before, na, sure, how))
+    where = f"{how}; the bead lies there. The planes stay as told, because focus against z is a gauge"
+    made.append(_of("bead's z", "µm", None, -found.values["focus_zero"], found.deviations["focus_zero"], where))
+    drift, lit = found.values["drift"], found.values["brightness"]
+    moved = drift - drift.mean((0, 1))
+    of = f"of planes {', '.join(map(str, planes))} (from 0); {how}"
+    made.append(_of("drift", "µm", None, moved, found.deviations["drift"], of))
+    made.append(_of("brightness", "", None, lit, found.deviations["brightness"] * lit, of))
+    if "aberrations" in found.values:
+        made.append(_aberrations(config, found, how))
+    return made
+
+
+def _of(name: str, unit: str, before: Value, value: Tensor, deviation: Tensor, how: str) -> FoundQuantity:
+    return FoundQuantity(name, unit, before, plain(value, 5), plain(deviation, 2), how)
+
+
+def _aberrations(config: Config, found: OpticsFound, how: str) -> FoundQuantity:
+    objective = config.microscope.objective
+    assert objective is not None
+    terms, known = config.calibration.aberrations, dict(objective.aberrations or {})
+    before = {str(term): number(known.get(term, 0.0)) for term in terms}
+    added, sure = (plain(part, 4) for part in (found.values["aberrations"], found.deviations["aberrations"]))
+    values = {name: float(f"{told + more:.4g}") for (name, told), more in zip(before.items(), added, strict=True)}
+    return FoundQuantity("aberrations", "rad", before, values, dict(zip(before, sure, strict=True)), how)
+
+
+def _shears(config: Config, found: OpticsFound, how: str) -> list[FoundQuantity]:
+    """Length and angle of each axis's shear, by its first prism."""
+    axes = axes_of(config.acquisition)
+    prisms = config.acquisition.prisms
+    firsts = [next(i for i, p in enumerate(prisms) if p is not None and axes[i] == a) for a in sorted(set(axes))]
+    told, now = [], []
+    for index in firsts:
+        for listed, acquisition in ((told, config.acquisition), (now, found.setup.acquisition)):
+            prism = acquisition.prisms[index]
+            assert prism is not None
+            y, x = (number(component) for component in prism.shear)
+            listed.append((math.hypot(y, x), math.atan2(y, x)))
+    deviations = found.deviations["shear"]
+    lengths = [float(f"{length:.5g}") for length, _ in now]
+    sure = plain(torch.tensor(lengths) * deviations[:, 0].cpu(), 2)
+    angles = [float(f"{angle:.5g}") for _, angle in now]
+    note = f"{how}; from +x towards +y (down)"
+    return [
+        FoundQuantity("shear's length", "µm", [length for length, _ in told], lengths, sure, how),
+        FoundQuantity("shear's angle", "rad", [a for _, a in told], angles, plain(deviations[:, 1], 2), note),
+    ]
+
+
+def _how(found: OpticsFound) -> str:
+    how = "the bead's images"
+    if found.noise:
+        ratio = found.misfit / found.noise
+        how += f", misfit {ratio:.2f} × the noise's"
+        if ratio > POOR and found.misfit - found.noise > LEAST:
+            how += ": they aren't explained; check the bead's radius and index, the medium's, wavelength and NA"
+    return how

@@ -1,0 +1,158 @@
+"""Values from a stack of a specimen that isn't known: what shows beside any volume, and why the rest doesn't."""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images
+from recon.calibration.optics import ShearOfAxes, axes_of
+from recon.calibration.profile import Least
+from recon.calibration.short_fits import can_be_tried
+from recon.config.schema import Config
+from recon.run.calibration.found import FoundQuantity, left, plain
+from recon.run.calibration.stack import CalibrationStack
+from torchdic import Acquisition
+from torchdic.scalar import number
+
+# Planes whose brightness and drift are looked at, at most.
+PLANES = 15
+
+# An angle, and an aperture's logarithm, that are as uncertain as this aren't told.
+UNSURE_ANGLE, UNSURE_APERTURE = math.radians(5), 0.1
+
+# Where the best volume leaves more than this many times what noise does, and this share of the contrast, what it
+# doesn't explain would be put down to the aperture.
+POOR, LEAST = 1.3, 0.03
+
+SCALE = "it sets the scale of Δn: with an unknown specimen another Δn explains the images as well; use a bead"
+
+
+def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationStack, list[FoundQuantity]]:
+    """The stack with what shows beside an unknown specimen, and each quantity. known: what has been found already."""
+    beside = stack.beside()
+    names = _untold(stack.config, known)
+    if not can_be_tried(beside.problem(beside.setup)):
+        why = "no prism has a linear response, without which no volume can be fitted beside it"
+        return stack, [left(name, "", None, why) for name in ("shear's angle", "condenser na")] + names
+    print("the shear's direction and the condenser's aperture, by volumes that are fitted with several …", flush=True)
+    beside = beside.held()
+    stack, angles = _angles(stack, beside)
+    beside = replace(beside, setup=replace(beside.setup, acquisition=_of_part(stack, beside)))
+    stack, aperture = _aperture(stack, beside)
+    stack, images = _images(stack)
+    return stack, [angles, *aperture, *images, *names]
+
+
+def _untold(config: Config, known: set[str]) -> list[FoundQuantity]:
+    """What an unknown specimen doesn't tell, and why."""
+    prisms = [prism for prism in config.acquisition.prisms if prism is not None]
+    lengths = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in prisms]
+    found = [left("shear's length", "µm", lengths, SCALE)]
+    if not {"bias", "compensator's zero"} & known:
+        several = len({round(abs(number(prism.bias)), 3) for prism in prisms}) > 1 or None in config.acquisition.prisms
+        pairs = len(prisms) > 1
+        why = SCALE
+        if pairs and not config.calibration.one_exposure:
+            told = "them" if several else "the compensator's zero"
+            why += f"; if all settings had one exposure, calibration.one_exposure = true finds {told} from the levels"
+        found.append(left("bias", "rad", [number(prism.bias) for prism in prisms], why))
+    found.append(left("focus zero", "µm", None, "focus against z is a gauge: the volume moves with the planes"))
+    why = "beside an unknown specimen they can't be told from its structure; use a bead"
+    found.append(left("aberrations", "rad", None, why))
+    return found
+
+
+def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, FoundQuantity]:
+    config = stack.config
+    axes = axes_of(config.acquisition)
+    found = find_angles(beside)
+    prisms = config.acquisition.prisms
+    firsts = [next(p for i, p in enumerate(prisms) if p is not None and axes[i] == a) for a in range(len(found))]
+    told = [math.atan2(number(prism.shear[0]), number(prism.shear[1])) for prism in firsts]
+    name, unit = "shear's angle", "rad"
+    if max(least.deviation for least in found) > UNSURE_ANGLE:
+        why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
+        return stack, left(name, unit, told, why)
+    turned = torch.tensor([[1.0, least.value] for least in found], dtype=torch.float64)
+    values = [float(f"{t + least.value:.5g}") for t, least in zip(told, found, strict=True)]
+    sure = [float(f"{least.deviation:.2g}") for least in found]
+    how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from +x towards +y (down)"
+    acquisition = _rounded(
+        ShearOfAxes(axes).put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
+    )
+    return stack.with_config(replace(config, acquisition=acquisition)), FoundQuantity(
+        name, unit, told, values, sure, how
+    )
+
+
+def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, list[FoundQuantity]]:
+    config, name = stack.config, "condenser na"
+    condenser = config.microscope.condenser
+    if condenser is None or number(condenser.na) == 0 or condenser.points is not None or condenser.inner_na is not None:
+        return stack, []
+    before = number(condenser.na)
+    found = find_aperture(beside)
+    lowest, alone = min(misfit for _, misfit in found.tried), beside.alone
+    if lowest > POOR * alone and lowest - alone > LEAST:
+        why = f"the best volume leaves {lowest / alone:.1f} × what noise does" if alone > 0 else "the fit is poor"
+        return stack, [left(name, "", before, f"{why}, which would be put down to it")]
+    if found.deviation > UNSURE_APERTURE:
+        return stack, [left(name, "", before, "volumes explain the images as well with other apertures")]
+    na = float(f"{before * math.exp(found.value):.4g}")
+    sure = float(f"{na * found.deviation:.2g}")
+    how = f"volumes fitted with {_tried([found])} apertures, misfit {_best([found], beside)}"
+    microscope = replace(config.microscope, condenser=replace(condenser, na=na))
+    quantity = FoundQuantity(name, "", before, na, sure, how)
+    return stack.with_config(replace(config, microscope=microscope)), [quantity]
+
+
+def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuantity]]:
+    """Brightness and drift of each image; drift that shows is to be learned by the reconstruction."""
+    config, beside = stack.config, stack.beside(PLANES)
+    values, deviations = find_images(beside)
+    planes = ", ".join(map(str, beside.part.planes))
+    how = f"beside a fitted volume, of planes {planes} (from 0)"
+    lit, drift = values["brightness"], values["drift"]
+    found = [
+        FoundQuantity(
+            "brightness", "", None, plain(lit, 5), plain(deviations["brightness"] * lit, 2), f"{how}; always learned"
+        )
+    ]
+    shows = bool((drift.abs() > 3 * deviations["drift"]).any())
+    learn = config.reconstruction.learn
+    if shows and "drift" not in learn:
+        how += "; it shows, so that the reconstruction learns it"
+        config = replace(config, reconstruction=replace(config.reconstruction, learn=(*learn, "drift")))
+    found.append(FoundQuantity("drift", "µm", None, plain(drift, 3), plain(deviations["drift"], 2), how))
+    return stack.with_config(config), found
+
+
+def _of_part(stack: CalibrationStack, beside: Beside) -> Acquisition:
+    acquisition = stack.config.acquisition
+    return replace(acquisition, focus=[acquisition.focus[plane] for plane in beside.part.planes])
+
+
+def _rounded(acquisition: Acquisition) -> Acquisition:
+    prisms = [
+        None
+        if prism is None
+        else replace(
+            prism,
+            shear=tuple(float(f"{number(part):.5g}") for part in prism.shear),
+            axis=None if prism.axis is None else float(f"{number(prism.axis):.5g}"),
+        )
+        for prism in acquisition.prisms
+    ]
+    return replace(acquisition, prisms=prisms)
+
+
+def _tried(found: list[Least]) -> int:
+    return sum(len(least.tried) for least in found)
+
+
+def _best(found: list[Least], beside: Beside) -> str:
+    lowest, highest = (pick(m for least in found for _, m in least.tried) for pick in (min, max))
+    if beside.alone == 0:
+        return f"{lowest:.3g} to {highest:.3g}"
+    return f"{lowest / beside.alone:.2f} to {highest / beside.alone:.2f} × the noise's"

@@ -1,0 +1,111 @@
+"""From a configuration and its stack to a calibrated configuration: signs and orders first, then values."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from recon.calibration.known_specimen import KnownSpecimen
+from recon.calibration.orders import Orders
+from recon.config.schema import BeadSection, Config, ConfigError
+from recon.fit.bounds import Bounds
+from recon.run.calibration.by_bead import by_bead
+from recon.run.calibration.by_levels import by_levels
+from recon.run.calibration.by_specimen import by_specimen
+from recon.run.calibration.found import FoundQuantity
+from recon.run.calibration.stack import CalibrationStack
+from recon.run.calibration.written import write_calibration
+from recon.run.reconstruct import prepare_folder
+
+# What no image tells, whatever is fitted.
+GAUGES = (
+    "a Δn that is the same everywhere (the volume's background is as told)",
+    "focus against z: planes that are all moved by the same distance move the volume",
+    "shear and bias reversed together: they give the same images",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a calibration found. config: with the found values. orders: None where they couldn't be tried."""
+
+    config: Config
+    orders: Orders | None
+    found: tuple[FoundQuantity, ...]
+
+
+def calibrate(config: Config, out: Path, device: torch.device, bead: KnownSpecimen | None = None) -> Calibration:
+    """Find what the stack's images tell of the optics, and leave calibrated.toml and calibration.json in a folder.
+
+    bead: the one that [calibration] names, where it names one. A line is printed for each quantity, and a table of the
+    signs and orders.
+    Raises ConfigError and StackError for bad input, before `out` is touched.
+    """
+    section = config.calibration.bead
+    if (section is None) != (bead is None):
+        raise ConfigError("calibration.bead: a bead is fitted where the configuration names one, and only there")
+    if all(prism is None for prism in config.acquisition.prisms):
+        raise ConfigError("acquisition.prisms: all images are bright field: there is no shear or bias to calibrate")
+    stack = CalibrationStack.read(config, device)
+    prepare_folder(out)
+    orders = stack.orders(bounds_of(config))
+    found = [_of_orders(orders, config)]
+    if orders is not None:
+        print(f"\nsigns and orders, by short fits of what may have been recorded:\n{orders.table()}\n")
+        stack = stack.with_config(replace(config, acquisition=orders.chosen.acquisition))
+    stack, by_background = by_levels(stack)
+    if bead is not None and section is not None:
+        stack, others = by_bead(stack, bead, section)
+        # a bead tells the biases better
+        by_background = [q for q in by_background if q.name not in {other.name for other in others}]
+    else:
+        stack, others = by_specimen(stack, {q.name for q in by_background if q.told})
+        told = {q.name for q in by_background}
+        others = [q for q in others if q.name not in told]
+    found += [*by_background, *others]
+    for quantity in found:
+        print(quantity.words)
+    print(f"not told by any image: {'; '.join(GAUGES)}")
+    calibration = Calibration(stack.config, orders, tuple(found))
+    write_calibration(out, calibration.config, orders, found, GAUGES, with_microscope=bead is not None)
+    return calibration
+
+
+def bounds_of(config: Config) -> Bounds:
+    """The bounds of Δn: a bead's own, or those of the reconstruction."""
+    bead: BeadSection | None = config.calibration.bead
+    if bead is None:
+        return config.reconstruction.bounds
+    contrast = bead.index - config.volume.background
+    return Bounds(0.0, None) if contrast > 0 else Bounds(None, 0.0)
+
+
+def _of_orders(orders: Orders | None, config: Config) -> FoundQuantity:
+    name, before = "signs and orders", "as declared"
+    if orders is None:
+        why = "no prism has a linear response, without which no short fit can be made"
+        return FoundQuantity(name, "", before, before, None, why, told=False)
+    chosen = next(tried for tried in orders.tried if tried.otherwise is orders.chosen)
+    others = [tried for tried in orders.tried if tried is not chosen and tried.rounds == chosen.rounds]
+    unit = orders.noise or 1.0
+    how = f"short fits of {len(orders.tried)} descriptions: misfit {chosen.misfit / unit:.2f} × the noise's"
+    if others:
+        nearest = min(others, key=lambda tried: tried.misfit)
+        how += f", {nearest.misfit / unit:.2f} × with {nearest.otherwise.name}"
+    bounds = config.reconstruction.bounds
+    free = (
+        config.calibration.bead is None
+        and None in (bounds.lower, bounds.upper)
+        and 0
+        not in (
+            bounds.lower,
+            bounds.upper,
+        )
+    )
+    if free:
+        how += "; the sign of Δn is free: signs and planes reversed together explain the images as well with −Δn"
+    if not orders.told:
+        how += "; the images hardly tell these two apart"
+    if orders.chosen.mistakes:
+        how += f"; {orders.chosen.what}: {orders.chosen.advice}"
+    return FoundQuantity(name, "", before, orders.chosen.name, None, how, told=orders.told)

@@ -1,0 +1,92 @@
+"""What a calibration found: each quantity with its value, its uncertainty and how it was found, or why it wasn't."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+# A value, or one for each prism, axis, image, …
+Value = Any
+
+
+@dataclass(frozen=True)
+class FoundQuantity:
+    """One quantity.
+
+    name: of it. unit: in words; empty for a pure number. before: what the configuration says; None where it says
+    nothing. value: what was found, or `before` where nothing was. uncertainty: one standard deviation, of the value's
+    shape; None where there is none. how: it was found, or why it was left. told: whether it was found.
+    """
+
+    name: str
+    unit: str
+    before: Value
+    value: Value
+    uncertainty: Value
+    how: str
+    told: bool = True
+
+    def as_json(self) -> dict[str, Any]:
+        """As calibration.json holds it."""
+        parts = ("value", "uncertainty", "how", "before", "unit")
+        return {part: getattr(self, part) for part in parts} | {"found": self.told}
+
+    @property
+    def words(self) -> str:
+        """In one line."""
+        if not self.told:
+            before = "" if self.before is None else f" ({self._short(self.before)}{'°' if self.unit == 'rad' else ''})"
+            return f"{self.name}: left as told{before}: {self.how}"
+        sure = "" if self.uncertainty is None else f" ± {self._short(self.uncertainty, 2)}"
+        unit = {"": "", "rad": "°"}.get(self.unit, f" {self.unit}")
+        before = "" if self.before is None else f", told {self._short(self.before)}{unit}"
+        return f"{self.name}: {self._short(self.value)}{sure}{unit}{before} ({self.how})"
+
+    def _short(self, value: Value, digits: int = 4) -> str:
+        """A value in a line, angles in degrees."""
+        return _short(_in_degrees(value) if self.unit == "rad" else value, digits)
+
+
+def left(name: str, unit: str, before: Value, why: str) -> FoundQuantity:
+    """A quantity that the images don't tell."""
+    return FoundQuantity(name, unit, before, before, None, why, told=False)
+
+
+def plain(value: torch.Tensor, digits: int = 6) -> Value:
+    """A tensor as numbers of a few significant digits, in lists of its shape."""
+
+    def rounded(number: Any) -> Any:
+        return [rounded(part) for part in number] if isinstance(number, list) else float(f"{number:.{digits}g}")
+
+    return rounded(value.detach().double().tolist())
+
+
+def _short(value: Value, digits: int = 4) -> str:
+    """A value in a line; of many numbers the least and the greatest."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name}: {_short(part, digits)}" for name, part in value.items())
+    numbers = _numbers(value)
+    if numbers is None:
+        return str(value)
+    if len(numbers) > 4:
+        return f"{min(numbers):.{digits}g} … {max(numbers):.{digits}g}"
+    return ", ".join(f"{number:.{digits}g}" for number in numbers)
+
+
+def _in_degrees(value: Value) -> Value:
+    if isinstance(value, dict):
+        return {name: _in_degrees(part) for name, part in value.items()}
+    return [_in_degrees(part) for part in value] if isinstance(value, list) else math.degrees(value)
+
+
+def _numbers(value: Value) -> list[float] | None:
+    if isinstance(value, int | float):
+        return [float(value)]
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        return None
+    parts = [_numbers(part) for part in value if part is not None]
+    if not parts or any(part is None for part in parts):
+        return None
+    return [number for part in parts for number in part or ()]
