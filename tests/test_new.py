@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from data_synthetic import Ellipsoid
+from data_synthetic.recorder.drawn import drawn
 from data_synthetic.recorder.faults import Faults
 from data_synthetic.recorder.record import Finer, record
 from data_synthetic.recorder.writing import KINDS, write_recording
@@ -241,12 +242,12 @@ def test_a_recording_in_few_bits_says_them(tmp_path, recording, capsys):
     assert "12 bits" in capsys.readouterr().out
 
 
-def setting(degrees, sure=3.0, likeness=(), *, signed=True):
+def setting(degrees, sure=3.0, likeness=(), *, signed=True, level=1000.0):
     """What a setting's images tell; None for degrees shows no direction."""
     direction = None
     if degrees is not None:
         direction = ShearDirection(math.radians(degrees), math.radians(sure), signed, 1)
-    return SettingSurvey(1000.0, (0.0, 0.0), 0.0, 0.0, np.ones(3), 10.0, direction, likeness)
+    return SettingSurvey(level, (0.0, 0.0), 0.0, 0.0, np.ones(3), 10.0, direction, likeness)
 
 
 LAYOUTS = {
@@ -261,6 +262,11 @@ LAYOUTS = {
         [setting(d) for d in (40, 40, 220, 130, 130, 310)],
         [(40, 90), (40, 90), (40, -90), (130, 90), (130, 90), (130, -90)],
     ),
+    "six frames: two shears with bias −, 0, +": (
+        [setting(d, level=1000.0 if d else 30.0) for d in (40, None, 220, 130, None, 310)],
+        [(40, 90), (40, 0), (40, -90), (130, 90), (130, 0), (130, -90)],
+    ),
+    "the first is dark": ([setting(None, level=30.0), setting(40)], [(40, 0), (40, 90)]),
     "the second shows none": ([setting(40), setting(None, likeness=(0.2,))], [(40, 90), (40, -90)]),
     "the second is as the first": ([setting(40), setting(None, likeness=(0.9,))], [(40, 90), (40, 90)]),
     "the fourth shows none": (
@@ -293,3 +299,24 @@ def test_the_angle_is_as_uncertain_as_its_settings_are_apart():
     found = Survey((setting(30, 2), setting(230, 2, (0.0,))), 1, None, nothing, nothing, 0)
     settled = settle(Gathered(Stack(np.ones((2, 3, 4, 4), np.uint16)), (), StatedSetup()), found, {})
     assert settled.prisms[0][1].why.startswith("± 5°")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_drawn_recordings_give_back_their_shears_signs_and_axes(tmp_path, seed):
+    """Each specimen, file and microscope: signs right, and axes to three of their uncertainties."""
+    found = drawn(seed, finer=Finer((2, 2, 2), 16, 24))
+    told, recording = found.told, found.recording
+    named = {"na": told.na, "condenser-na": told.condenser_na, "background": told.background}
+    words = [word for name, value in named.items() for word in (f"--{name}", value)]
+    stack = write_recording(recording, tmp_path / f"s.{found.file_kind}.tif", found.file_kind)
+    out = tmp_path / "run.toml"
+    assert new(stack, "--out", out, *words, *(["--lower"] if told.lower else [])) == 0
+    sure = [float(words.split("°")[0]) for words in out.read_text().split("measured: ± ")[1:]]
+    for prism, true, uncertainty in zip(load(out).acquisition.prisms, recording.acquisition.prisms, sure, strict=False):
+        assert prism is not None
+        assert true is not None
+        (y, x), (ty, tx) = (tuple(map(float, each.shear)) for each in (prism, true))
+        sign = math.copysign(1.0, float(prism.bias)) * math.copysign(1.0, float(true.bias))
+        wrong = math.degrees(math.atan2(sign * (ty * x - tx * y), sign * (ty * y + tx * x)))
+        assert abs(wrong) < 3 * uncertainty + 0.5  # which is printed as a whole number

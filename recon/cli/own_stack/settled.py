@@ -5,8 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from recon.config.commented import Sourced
 from recon.recording.survey.survey import SettingSurvey, Survey
 from torchdic.files.gathered import Gathered
@@ -16,6 +14,9 @@ WAVELENGTH, NA, BACKGROUND, _BIAS_DEGREES, _ANGLE_DEGREES = 0.55, 0.9, 1.335, 90
 
 # Slices are no thicker than this many µm: light bends within them.
 _THICKEST = 1.0
+
+# Level of a setting's background relative to the brightest one's, below which it has no bias.
+_DARK = 0.2
 
 # Correlation of two settings' images, below which they aren't the same setting.
 _UNLIKE = 0.5
@@ -123,16 +124,25 @@ def _chosen(given: float | None, said: float | None, guess: float, name: str, wh
 def _prisms(
     found: Survey, given: Mapping[str, float | None], usual: float
 ) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
-    """Length, angle and bias of each setting's shear; the first bias along an axis is taken as above 0."""
+    """Length, angle and bias of each setting's shear; the first bias along an axis is taken as above 0.
+
+    A setting much darker than the brightest has bias 0, and the axis of the one before it: its images don't show any.
+    """
     length = _chosen(given.get("shear"), None, usual, "shear's length", "λ/(2·NA), as is usual; the maker knows it")
     size = _chosen(given.get("bias"), None, _BIAS_DEGREES, "bias", "a quarter wave; the compensator shows it")
     axes: list[_Axis] = []
     places: list[tuple[int, float]] = []
+    brightest = max(setting.level for setting in found.settings)
     for setting in found.settings:
-        places.append(_place(setting, axes, places))
+        if setting.level < _DARK * brightest:
+            places.append((places[-1][0] if places else 0, 0.0))
+        else:
+            places.append(_place(setting, axes, places))
     lower, told = bool(given.get("lower")), given.get("shear_angle")
     angles = [_angle(axis, None if number else told, lower=lower) for number, axis in enumerate(axes)]
-    return tuple((length, angles[axis], replace(size, value=sign * size.value)) for axis, sign in places)
+    dark = replace(size, value=0.0, origin="measured", why="its empty field is dark beside another setting's")
+    biases = [replace(size, value=sign * size.value) if sign else dark for _, sign in places]
+    return tuple((length, angles[axis], bias) for (axis, _), bias in zip(places, biases, strict=True))
 
 
 @dataclass
@@ -175,13 +185,13 @@ def _likely(setting: SettingSurvey, places: Sequence[tuple[int, float]]) -> tupl
 
     What all settings have in common, as out of focus, makes them alike; opposite biases on one axis are the least so.
     """
-    if not places:
+    others = [(like, *place) for like, place in zip(setting.likeness, places, strict=True) if place[1]]
+    if not others:
         return 0, 1.0
-    least = int(np.argmin(setting.likeness))
-    if setting.likeness[least] < _UNLIKE:
-        axis, sign = places[least]
+    like, axis, sign = min(others)
+    if like < _UNLIKE:
         return axis, -sign
-    return places[int(np.argmax(setting.likeness))]
+    return max(others)[1:]
 
 
 def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
