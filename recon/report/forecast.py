@@ -1,5 +1,6 @@
 """How long a descent will take: foreseen before its first step, and followed as its steps are taken."""
 
+import warnings
 from collections.abc import MutableMapping
 from statistics import mean
 from typing import Any
@@ -59,7 +60,9 @@ class Forecast:
         if fidelity is None:
             return None
         scene = _scene(self._problem)
-        return seconds(*scene, fidelity) / work(fidelity, *scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the descent's own images will warn
+            return seconds(*scene, fidelity) / work(fidelity, *scene)
 
 
 def _scene(problem: Problem) -> tuple[Volume, Microscope, Acquisition]:
