@@ -97,8 +97,8 @@ class Case:
     be finite only, and those of the scalars obey the law. gradient_rounding: float32's error of the gradient in eps,
     relative to its norm. cancels: scalars whose gradient is a small rest of its pixels' terms, so that its error is
     relative to the sum of these terms' sizes instead. refused: the error and what its line says. warned: likewise.
-    sample: whether rays belong to the sample that `make test` runs, as straight rays and waves do. slow: whether they
-    don't either.
+    sample: whether its rays and its gradients belong to the sample that `make test` runs, as the images of straight
+    rays and waves do. slow: whether none of it does.
     """
 
     name: str

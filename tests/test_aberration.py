@@ -71,7 +71,7 @@ def apparent_depths(thickness, index, sine):
     return x / outside, (x_after - x_before) / (after - before)
 
 
-@pytest.mark.parametrize("contrast", [0.15, -0.1])
+@pytest.mark.parametrize("contrast", [0.15, pytest.param(-0.1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("momentum", [(0.0, 0.4), (-0.3, 0.6), (0.9, 0.0)])
 def test_plate_shifts_by_its_mean_apparent_depth(contrast, momentum):
     """δ = t − (d_s + d_t)/2, which is t·{1 − ½[p_z0/p_z + n²p_z0³/(n0²p_z³)]}."""

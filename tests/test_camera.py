@@ -336,6 +336,26 @@ def test_simulated_pixels_are_the_cameras_and_their_size_is_in_the_file(config, 
     assert stack.pixel_size == pytest.approx((0.4, 0.4))
 
 
+@pytest.mark.parametrize("side", [0.2, 0.4, 0.13])
+def test_what_a_pixel_passes_of_a_wave_is_what_its_mean_leaves(side):
+    """Of each wave that is below the pixels' own Nyquist frequency, one amplitude: the waves of 12 × 15 voxels."""
+    (ny, nx), spacing = (12, 15), (0.2, 0.2)
+    camera = Camera(pixel_size=side)
+    passed = camera.passed((ny, nx), spacing)
+    assert passed.shape == (ny, nx // 2 + 1)
+    assert torch.equal(Camera().passed((ny, nx), spacing), torch.ones_like(passed))
+    y, x = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in (ny, nx))
+    for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (1, 2)):
+        wave = torch.cos(2 * math.pi * row * y / ny)[:, None] * torch.cos(2 * math.pi * column * x / nx)
+        rows, columns = camera.pixels((ny, nx), spacing)
+        v, u = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * side for n in (rows, columns))
+        sampled = torch.cos(2 * math.pi * row * v / (ny * 0.2))[:, None] * torch.cos(
+            2 * math.pi * column * u / (nx * 0.2)
+        )
+        found = camera.integrate(wave, spacing)
+        torch.testing.assert_close(found, passed[row, column] * sampled, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     "recipe", [{"steps": 3}, {"steps": 3, "support": "edges", "margin": 3}, {"steps": 12, "method": "adam"}]
 )

@@ -128,7 +128,7 @@ OF_RAYS = ("plain", "lenses of matrices")
 @pytest.mark.parametrize(
     ("propagation", "name"),
     [
-        pytest.param(propagation, name, marks=pytest.mark.slow if propagation == "rays" and name not in OF_RAYS else ())
+        pytest.param(propagation, name, marks=pytest.mark.slow if propagation != "wave" and name not in OF_RAYS else ())
         for propagation in ("projection", "rays", "wave")
         for name in SCOPES
     ],

@@ -130,13 +130,12 @@ def test_image_obeys_its_law(record_property, case, propagation, dtype):
         cell("light", float(images[1].mean()), case.law("bright", propagation) + 1e-14)
 
 
-# beyond the sample in float32 alone, which is compared with float64's
 GRADIENTS = [
     pytest.param(
         dtype,
         *cell.values,
         id=f"{str(dtype).removeprefix('torch.')}-{cell.id}",
-        marks=[pytest.mark.slow] if dtype == torch.float64 and not cell.values[0].sample else cell.marks,
+        marks=cell.marks if cell.values[0].sample else [pytest.mark.slow],
     )
     for dtype in (torch.float32, torch.float64)
     for cell in CELLS

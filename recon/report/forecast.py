@@ -1,5 +1,6 @@
 """How long a descent will take: foreseen before its first step, and followed as its steps are taken."""
 
+import warnings
 from collections.abc import MutableMapping
 from statistics import mean
 from typing import Any
@@ -10,8 +11,10 @@ from recon.fit.newton.correction import drafts
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
-from torchdic import Fidelity
+from torchdic import Acquisition, Fidelity, Microscope, Volume
+from torchdic.instrument.microscope import limited
 from torchdic.planning.cost import directions, seconds, work
+from torchdic.scalar import number
 
 # What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
 # direction; the weak specimen's Hessian of some directions, in images of them; how often the correction is renewed.
@@ -56,9 +59,17 @@ class Forecast:
         fidelity = _careful(self._problem)
         if fidelity is None:
             return None
-        setup = self._problem.setup
-        scene = setup.volume, setup.microscope, setup.acquisition
-        return seconds(*scene, fidelity) / work(fidelity, *scene)
+        scene = _scene(self._problem)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the descent's own images will warn
+            return seconds(*scene, fidelity) / work(fidelity, *scene)
+
+
+def _scene(problem: Problem) -> tuple[Volume, Microscope, Acquisition]:
+    """What the images of a problem are made of, lit by the light that enters the medium."""
+    setup = problem.setup
+    volume = setup.volume
+    return volume, limited(setup.microscope, number(volume.background), volume.delta.dtype), setup.acquisition
 
 
 def _careful(problem: Problem) -> Fidelity | None:
@@ -68,8 +79,7 @@ def _careful(problem: Problem) -> Fidelity | None:
 
 def _cost(problem: Problem, number: int) -> float:
     """What a step costs, in the work of its images; number: counted from 0."""
-    setup = problem.setup
-    scene = setup.volume, setup.microscope, setup.acquisition
+    setup, scene = problem.setup, _scene(problem)
     careful = _careful(problem)
     if problem.method == "adam":
         if careful is None:
@@ -80,7 +90,7 @@ def _cost(problem: Problem, number: int) -> float:
     coarse, fine = drafts(careful, problem.fidelity.draft_sources)
     draft = coarse if number < COARSE_STEPS else fine
     each = work(draft, *scene)
-    cost = WITH_GRADIENT * each + MODEL * each / directions(setup.microscope, draft.sources)
+    cost = WITH_GRADIENT * each + MODEL * each / directions(scene[1], draft.sources)
     if number in (0, COARSE_STEPS):
         cost += HESSIAN * each
     if number >= COARSE_STEPS and fine != careful:
