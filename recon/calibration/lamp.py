@@ -49,9 +49,9 @@ class Lamp(Nuisance):
         return misfit.data.new_zeros(misfit.data.shape[0], TERMS)
 
     def put(self, value: Tensor, setup: Setup) -> Setup:
-        """The setup with this lamp. Raises ValueError for one without a lamp."""
+        """The setup with this lamp. Raises TypeError for one without a lamp."""
         if not isinstance(setup, UnevenSetup):
-            raise ValueError("this setup's lamp is even")
+            raise TypeError("this setup's lamp is even")
         return replace(setup, lamp=value)
 
 
