@@ -43,7 +43,7 @@ def main() -> int:
     try:
         config = load(CONFIG)
         assert config.data is not None
-        path = options.image or _in_data_folder(Path(config.data.path).name)
+        path = options.image or _in_data_folder(Path(config.data.files[0]).name)
         image = read_stack(path).data[0, 0].astype(float)
         try:
             axis = estimate_shear_axis(image)

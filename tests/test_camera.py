@@ -1,6 +1,7 @@
 """The camera: pixels that see their whole area, noise from the given generator alone, and counts."""
 
 import math
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from data_synthetic import Bead
 from recon.cli import main
 from recon.config.conversion import dump
 from recon.config.reading import load
+from recon.config.schema import ConfigError
 from recon.run.data import load_data
 from recon.run.exact_images import exact_images
 from torchdic import (
@@ -27,7 +29,7 @@ from torchdic import (
     image,
     image_field,
 )
-from torchdic.files.stack import read_stack
+from torchdic.files.stack import read_stack, read_volume
 
 
 def seeded(seed=0):
@@ -326,15 +328,83 @@ def test_counts_are_scaled_to_the_empty_field_of_the_microscope_that_is_declared
     assert abs(float((found - expected).mean())) < 0.002
 
 
-def test_simulated_pixels_are_the_cameras_and_their_size_is_in_the_file(config, tmp_path, capsys):
+def test_simulated_pixels_are_the_cameras_and_their_size_is_in_the_file(config, tmp_path):
     path = config(pixel_size=24.0, magnification=60.0)
     assert main(["simulate", str(path), "--out", str(tmp_path / "simulated"), "--device", "cpu"]) == 0
     stack = read_stack(tmp_path / "simulated" / "stack.ome.tif")
     assert stack.data.shape == (1, 3, 18, 16)
     assert stack.pixel_size == pytest.approx((0.4, 0.4))
-    capsys.readouterr()
+
+
+@pytest.mark.parametrize("side", [0.2, 0.4, 0.13])
+def test_what_a_pixel_passes_of_a_wave_is_what_its_mean_leaves(side):
+    """Of each wave that is below the pixels' own Nyquist frequency, one amplitude: the waves of 12 × 15 voxels."""
+    (ny, nx), spacing = (12, 15), (0.2, 0.2)
+    camera = Camera(pixel_size=side)
+    passed = camera.passed((ny, nx), spacing)
+    assert passed.shape == (ny, nx // 2 + 1)
+    assert torch.equal(Camera().passed((ny, nx), spacing), torch.ones_like(passed))
+    y, x = (torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in (ny, nx))
+    for row, column in ((0, 0), (0, 2), (1, 1), (2, 0), (1, 2)):
+        wave = torch.cos(2 * math.pi * row * y / ny)[:, None] * torch.cos(2 * math.pi * column * x / nx)
+        rows, columns = camera.pixels((ny, nx), spacing)
+        v, u = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * side for n in (rows, columns))
+        sampled = torch.cos(2 * math.pi * row * v / (ny * 0.2))[:, None] * torch.cos(
+            2 * math.pi * column * u / (nx * 0.2)
+        )
+        found = camera.integrate(wave, spacing)
+        torch.testing.assert_close(found, passed[row, column] * sampled, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "recipe", [{"steps": 3}, {"steps": 3, "support": "edges", "margin": 3}, {"steps": 12, "method": "adam"}]
+)
+@pytest.mark.usefixtures("no_pictures")
+def test_a_stack_on_the_cameras_pixels_is_reconstructed_on_the_volumes_voxels(config, tmp_path, capsys, recipe):
+    path = config(pixel_size=24.0, magnification=60.0)
+    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    values |= {"data": {"path": "simulated/stack.ome.tif", "offset": 100.0}, "reconstruction": recipe}
+    path.write_text(tomli_w.dumps(values), encoding="utf-8")
+    assert main(["simulate", str(path), "--out", str(tmp_path / "simulated"), "--device", "cpu"]) == 0
+    assert main(["reconstruct", str(path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 0
+    volume, grid = read_volume(tmp_path / "out" / "volume.ome.tif")
+    assert grid.spacing == pytest.approx(tuple(values["volume"]["spacing"]))
+    assert volume.shape == tuple(values["volume"]["shape"])
+    misfits = [float(row.split(",")[1]) for row in (tmp_path / "out" / "log.csv").read_text().splitlines()[1:]]
+    assert misfits[-1] < 0.8 * misfits[0]
+    assert "its pixels are" not in capsys.readouterr().err  # the file's are the camera's
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pixel_size": 30.0}, "pixels (y × x), the volume of"),
+        (
+            {"pixel_size": 99.0, "magnification": 9.0},
+            "microscope.camera.pixel_size: a pixel of 11 µm doesn't fit into an image of",
+        ),
+    ],
+)
+def test_pixels_that_are_not_the_stacks_are_told_with_the_law(config, tmp_path, capsys, changes, message):
+    path = config(pixel_size=24.0, magnification=60.0)
+    assert main(["simulate", str(path), "--out", str(tmp_path / "simulated"), "--device", "cpu"]) == 0
+    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    values["microscope"]["camera"] |= changes
+    values["data"] = {"path": "simulated/stack.ome.tif"}
+    path.write_text(tomli_w.dumps(values), encoding="utf-8")
     assert main(["reconstruct", str(path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
-    assert "microscope.camera.pixel_size: 24.0 can be simulated" in capsys.readouterr().err
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert message in line
+
+
+@pytest.mark.parametrize("method", ["linear", "opl"])
+def test_a_method_that_takes_voxels_alone_says_so(config, tmp_path, method):
+    path = config(pixel_size=24.0, magnification=60.0)
+    values = tomllib.loads(path.read_text(encoding="utf-8"))
+    values |= {"data": {"path": "stack.ome.tif"}, "reconstruction": {"method": method}}
+    path.write_text(tomli_w.dumps(values), encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"'{method}' takes pixels that are voxels, microscope.camera.pixel_size is"):
+        load_data(load(path))
 
 
 def test_camera_loads_and_is_dumped_again(config, tmp_path):

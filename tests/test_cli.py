@@ -232,9 +232,9 @@ def test_a_stack_among_several_is_taken_by_its_number(write, run, tmp_path):
     assert np.allclose(read.data, data[1])
 
 
-def test_an_extinct_prisms_counts_ask_for_a_scale(write, refused, tmp_path):
+def test_counts_of_extinct_prisms_alone_ask_for_a_scale(write, refused, tmp_path):
     write_stack(tmp_path / "stack.ome.tif", (1000 * stack()).astype(np.uint16))
-    prisms = [{"shear": [0.0, 0.24], "bias": 0.0}, {"shear": [0.24, 0.0], "bias": 1.0}]
+    prisms = [{"shear": [0.0, 0.24], "bias": 0.0}, {"shear": [0.24, 0.0], "bias": 0.01}]
     assert "give scale" in refused("reconstruct", write({"acquisition.prisms": prisms}))
 
 

@@ -7,6 +7,7 @@ import pytest
 from refusal import the_error
 
 from recon.config import dump, load
+from recon.config.media import MEDIA
 from recon.config.spelling import direction
 
 CANONICAL = {
@@ -144,3 +145,74 @@ def test_another_unit_is_named_in_the_spelling_that_was_used(write, given, named
     message = the_error(write(text(**given)))
     assert named in message
     assert meant in message
+
+
+# --- layers -----------------------------------------------------------------------------------------------------------
+
+OIL_ON_WATER = "{ depth = 10, medium = 'water', design = 'oil' }"
+
+
+def with_layer(layer):
+    return text().replace("{ na = 0.9 }", f"{{ na = 1.2, layer = {layer} }}")
+
+
+@pytest.mark.parametrize(
+    "layer",
+    [
+        OIL_ON_WATER,
+        "{ thickness = 10, medium = 1.3345, design = 1.518 }",
+        "{ depth = 10, index = 1.3345, design_index = 1.518 }",
+    ],
+)
+def test_a_layer_by_the_names_of_its_media_is_one_by_their_indices(write, layer):
+    found = load(write(with_layer(layer))).microscope.objective.layer
+    assert (found.thickness, found.index, found.design_index) == (10.0, 1.3345, 1.518)
+    resolved = dump(load(write(with_layer(layer))))
+    assert tomllib.loads(resolved)["microscope"]["objective"]["layer"] == {
+        "thickness": 10.0,
+        "index": 1.3345,
+        "design_index": 1.518,
+    }
+
+
+def test_an_included_layers_medium_is_replaced_in_either_spelling(write):
+    write(with_layer(OIL_ON_WATER), "base.toml")
+    path = write('include = "base.toml"\n[microscope.objective.layer]\nindex = 1.4\ndesign = "glass"\n')
+    found = load(path).microscope.objective.layer
+    assert (found.thickness, found.index, found.design_index) == (10.0, 1.4, 1.5255)
+
+
+def test_media_are_in_the_order_of_their_indices_and_water_is_water():
+    """At 546 nm: of air 277 millionths above vacuum, of water 1.3345, of immersion oil ISO 8036's 1.5180 ± 0.0005."""
+    assert list(MEDIA.values()) == sorted(MEDIA.values())
+    assert MEDIA["air"] == pytest.approx(1.000277, abs=5e-5)
+    assert MEDIA["water"] == pytest.approx(1.3345, abs=1e-4)
+    assert MEDIA["oil"] == pytest.approx(1.5180, abs=5e-4)
+    # Rheims et al., with λ in µm
+    assert MEDIA["glycerol"] == pytest.approx(1.45797 + 0.00598 / 0.5461**2 - 0.00036 / 0.5461**4, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("layer", "message"),
+    [
+        (
+            "{ depth = 10, medium = 'watre', design = 'oil' }",
+            "microscope.objective.layer.medium: 'watre' must be one of 'air' (1.0003), 'water' (1.3345), ",
+        ),
+        (
+            "{ depth = 10, medium = true, design = 'oil' }",
+            "microscope.objective.layer.medium: True must be the name of a medium, or its index",
+        ),
+        (
+            "{ depth = 10, medium = 'water', index = 1.33, design = 'oil' }",
+            "microscope.objective.layer.index and microscope.objective.layer.medium say the same: leave one out",
+        ),
+        ("{ depth = 10, medum = 'water', design = 'oil' }", "unknown key microscope.objective.layer.medum; did you"),
+        ("{ depth = 10, medium = 'water' }", "missing key microscope.objective.layer.design_index"),
+        ("{ depth = '10', medium = 'water', design = 'oil' }", "microscope.objective.layer.depth: '10' must be a numb"),
+        ("{ depth = 1e-5, medium = 'water', design = 'oil' }", "microscope.objective.layer.depth: 1e-05 µm is no thic"),
+        ("{ depth = 10, medium = 'water', design = 'air' }", "microscope.objective: objective NA 1.2 exceeds the"),
+    ],
+)
+def test_a_layer_of_no_known_medium_is_refused(write, layer, message):
+    assert the_error(write(with_layer(layer))).startswith(message)

@@ -372,3 +372,15 @@ def test_a_measured_lzw_compressed_ome_tiff(measured_file):
     assert stack.data.shape == (1, 1, 325, 475)
     assert stack.data.dtype == np.uint16
     assert stack.pixel_size == pytest.approx((1.08333, 1.08333), rel=1e-5)
+
+
+def test_a_dark_frame_has_the_scale_of_the_others():
+    """Bias 0 between ±60°, as one lamp and one exposure give them; alone it tells none."""
+    random, biases = np.random.default_rng(0), (-math.pi / 3, 0.0, math.pi / 3)
+    empty = np.array([math.sin(bias / 2) ** 2 for bias in biases])[:, None, None, None]
+    light = empty + 0.1 * random.random((3, 2, 20, 20)) * (np.arange(20) < 5)
+    stack = Stack((100 + 20000 * light).round().astype(np.uint16), source="stack.tif")
+    expected = ExpectedStack(biases, (0.0, 1.0), (0.1, 0.1))
+    with pytest.warns(StackWarning, match=r"prism 1's empty field is dark and tells no scale: .* 2e\+04 per empty"):
+        measured = prepare(stack, expected, Normalisation(offset=100.0, order=0))
+    assert measured.data == pytest.approx(light, abs=1e-3)

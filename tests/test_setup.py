@@ -7,7 +7,7 @@ import torch
 from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem, Recipe
-from recon.fit.setup import Setup, empty_medium, shifted
+from recon.fit.setup import Setup, empty_medium, on_voxels, pixels_of, shifted
 from recon.fit.unknowns import IndexDifference
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
@@ -195,11 +195,47 @@ def test_a_linear_start_knows_the_drift_and_the_brightness():
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-8)
 
 
-def test_a_linear_start_from_a_cameras_pixels_is_refused():
-    known = replace(setup(), microscope=replace(MICROSCOPE, camera=Camera(pixel_size=0.4)))
-    data = known.images(FIDELITY)
-    with pytest.raises(ValueError, match="linear start asks for images whose pixels are voxels"):
-        IndexDifference(5e-3, Bounds(), "linear").start(known, GaussianMisfit(data))
+@pytest.mark.parametrize("pixel", [0.2, 0.3, 0.1])
+def test_a_linear_start_from_a_cameras_pixels_is_near_that_from_voxels(pixel):
+    grid = Grid((4, 24, 30), (0.5, 0.2, 0.2))
+    plain = Setup(Volume(grid, ball(grid), BACKGROUND), MICROSCOPE, ACQUISITION)
+    camera = replace(plain, microscope=replace(MICROSCOPE, camera=Camera(pixel_size=pixel)))
+    index = IndexDifference(5e-3, Bounds(), "linear")
+    starts = [index.value(index.start(each, GaussianMisfit(each.images(FIDELITY)))) for each in (plain, camera)]
+    assert float((starts[1] - starts[0]).norm() / starts[0].norm()) < 0.12
+
+
+@pytest.mark.parametrize("pixel", [0.1, 0.2, 0.3, 0.4])
+def test_a_linear_ramp_on_a_cameras_pixels_is_the_same_ramp_on_voxels(pixel):
+    """Cubic interpolation keeps straight lines; beyond the outermost pixels' centres they are held."""
+    field = Grid((2, 20, 24), (0.5, 0.2, 0.2))
+    pixels = pixels_of(field, replace(MICROSCOPE, camera=Camera(pixel_size=pixel)))
+
+    def ramp(grid):
+        y, x = (grid.coordinates(axis, dtype=torch.float64) for axis in (1, 2))
+        return (0.3 * y[:, None] - 0.7 * x).expand(3, 2, -1, -1)
+
+    found = on_voxels(ramp(pixels), pixels, field)
+    within = (..., slice(4, -4), slice(4, -4))
+    torch.testing.assert_close(found[within], ramp(field)[within], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pixel", [0.4, 0.3, 0.13])
+def test_a_misfit_on_a_cameras_pixels_differentiates_in_the_index(pixel):
+    """Autograd against a central difference along a direction, through slabs and pixels; float64."""
+    grid = Grid((3, 12, 14), (0.5, 0.2, 0.2))
+    camera = replace(MICROSCOPE, camera=Camera(pixel_size=pixel))
+    misfit = GaussianMisfit(Setup(Volume(grid, ball(grid), BACKGROUND), camera, ACQUISITION).images(FIDELITY))
+
+    def value(delta):
+        return misfit(Setup(Volume(grid, delta, BACKGROUND), camera, ACQUISITION).images(FIDELITY))
+
+    delta = (0.5 * ball(grid)).requires_grad_()
+    direction, step = 0.01 * torch.randn(grid.shape, dtype=torch.float64), 1e-3
+    (gradient,) = torch.autograd.grad(value(delta), delta)
+    with torch.no_grad():
+        expected = (value(delta + step * direction) - value(delta - step * direction)) / (2 * step)
+    assert float((gradient * direction).sum()) == pytest.approx(float(expected), rel=1e-6)
 
 
 def test_a_specimen_that_goes_on_beyond_the_field_is_explained_with_a_margin_alone():

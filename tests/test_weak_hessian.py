@@ -192,11 +192,18 @@ def test_cosines_fill_the_band_of_the_larger_aperture():
     assert axial_band(oil) > axial_band(setup)
 
 
-def test_a_camera_s_pixels_play_no_part_but_by_the_weights():
-    """Weights are by voxels: the pixels of a camera average what the microscope forms."""
-    x = ball()
-    camera = replace(MICROSCOPE, camera=Camera(pixel_size=0.4))
-    torch.testing.assert_close(made(setup_of(microscope=camera))(x), made(setup_of())(x))
+@pytest.mark.parametrize(("pixel", "kind"), [(0.4, "smooth"), (0.2, "smooth"), (0.2, "random"), (0.1, "smooth")])
+def test_a_cameras_pixels_pass_less_of_a_wave_the_shorter_it_is(pixel, kind):
+    """Second differences of the camera's images, a pixel for as many voxels as it covers.
+
+    Coarse pixels mix waves of a random volume that look alike on them, which the Hessian leaves out.
+    """
+    setup = setup_of(microscope=replace(MICROSCOPE, camera=Camera(pixel_size=pixel)))
+    hessian = made(setup)
+    direction = torch.randn(GRID.shape, dtype=torch.float64) if kind == "random" else ball()
+    found = float((direction * hessian(direction)).sum()) - 0.01 * hessian.mean * float(direction.square().sum())
+    voxels_a_pixel = (pixel / 0.2) ** 2
+    assert found == pytest.approx(voxels_a_pixel * curved(setup, direction), rel=0.03 if kind == "random" else 2e-3)
 
 
 def test_it_stays_on_its_device():

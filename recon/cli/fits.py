@@ -15,7 +15,7 @@ from recon.fit.step import Step
 from recon.report import figures
 from recon.report.fit_fronts import draw_fits, fits_table
 from recon.report.fit_trial import FitCandidate
-from recon.run.data import check_pixels, load_data, prepared
+from recon.run.data import load_data, prepared
 from recon.run.fits.finer import FinerModel
 from recon.run.fits.kept import KeptTrials
 from recon.run.fits.ladder import fits_of
@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> None:
     """Fit the configuration's stack by each candidate; leave fits.csv, fits.json and fits.png, and print a table."""
     signal.signal(signal.SIGTERM, _interrupt)
     config = load(options.config)
-    check_pixels(config)
+    _check_pixels(config)
     candidates = fits_of(config)
     recorded = _recorded(config, str(options.config), options.device)
     prepare_folder(options.out)
@@ -43,6 +43,16 @@ def run(options: argparse.Namespace) -> None:
     scene = "measured stack" if config.specimen is None else str(config.specimen["kind"])
     figures.save(draw_fits({scene: found}), options.out / "fits.png")
     print(f"\n{options.out / 'fits.csv'}, .json and .png: {len(found)} fits")
+
+
+def _check_pixels(config: Config) -> None:
+    """Raise ConfigError where the camera's pixels aren't the volume's voxels."""
+    camera = config.microscope.camera
+    if camera is not None and camera.pixel_size is not None:
+        raise ConfigError(
+            f"microscope.camera.pixel_size: {camera.pixel_size:g}: fits are compared on pixels that are the volume's "
+            "voxels; leave it out and give voxels the size of the pixels"
+        )
 
 
 def _try_each(recorded: Recorded, candidates: Sequence[FitCandidate], kept: KeptTrials) -> None:
@@ -76,7 +86,7 @@ def _recorded(config: Config, source: str, device: torch.device) -> Recorded:
     if config.specimen is None:
         if config.data is None:
             raise ConfigError(f"{source}: missing key specimen or data.path: fits need a known specimen or a stack")
-        print(f"{config.data.path}: the truth isn't known; the misfit over the noise is all that is told")
+        print(f"{', '.join(config.data.files)}: the truth isn't known; the misfit over the noise is all that is told")
         return Recorded(config, load_data(config), None, device)
     specimen, model, grid = specimen_of(config, source), FinerModel(), config.volume.grid
     exact = hasattr(specimen, "field")

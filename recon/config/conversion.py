@@ -25,10 +25,8 @@ from recon.config.schema import (
     WedgeSection,
     WorkPrecisionSection,
 )
+from recon.config.spelling import BRIGHT_FIELD
 from torchdic import Acquisition, Candidate, Condenser, JonesPupil, Layer, Objective, Polarisation, Prism, Spectrum
-
-# The name by which a list of prisms holds bright field, which has none.
-BRIGHT_FIELD = "brightfield"
 
 # TOML has no null. This word switches off what has a default.
 NONE = "none"
@@ -251,7 +249,11 @@ FIELDS: dict[type, dict[str, Hook]] = {
     Condenser: {"points": _tensor, "weights": _tensor},
     Spectrum: dict.fromkeys(("wavelengths", "weights"), _array_of(_number)),
     Acquisition: {"prisms": _array_of(_prism), "focus": _array_of(_number)},
-    DataSection: {"scale": _or("background", _number)},
+    DataSection: {
+        "scale": _or("background", _number),
+        "paths": _array_of(_string),
+        "channels": _array_of(_whole_number),
+    },
     ReconstructionSection: {
         "tv": _or("auto", _weights),
         "learn": _array_of(_string),

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import os
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +11,7 @@ from cattrs import transform_error
 from cattrs.errors import ForbiddenExtraKeysError
 
 from recon.config.conversion import converter
-from recon.config.encoding import decoded
+from recon.config.including import INCLUDE, values_of
 from recon.config.schema import Config, ConfigError, UnitsWarning
 from recon.config.spelling import FURTHER, canonical, unknown_key
 from recon.config.units import wrong_unit
@@ -21,34 +20,28 @@ T = TypeVar("T")
 
 
 def load(path: str | os.PathLike[str]) -> Config:
-    """Read a configuration file. A relative path in it starts from its folder.
+    """Read a configuration file, with those that it includes. A relative path in a file starts from its folder.
 
     Raises ConfigError where the file can't be used, or where a value can't be in its unit, such as a wavelength of 546
     µm. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit.
     """
     path = Path(path)
     try:
-        values = tomllib.loads(decoded(path.read_bytes()))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except ValueError as error:  # TOMLDecodeError is one
-        raise ConfigError(f"{path}: is not TOML: {error}") from error
+        values, included = values_of(path)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    # what is wrong may stand in any of them
+    source = f"{path} (with {', '.join(file.name for file in included)})" if included else str(path)
     wrong = wrong_unit(values)
     if wrong is not None:
-        raise ConfigError(f"{path}: {wrong}")
+        raise ConfigError(f"{source}: {wrong}")
     try:
         values = canonical(values)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}") from error
-    config = structure(values, Config, str(path))
-    if config.data is not None:
-        given = {"path": config.data.path, "mask": config.data.mask}
-        files = {key: str((path.parent / name).resolve()) for key, name in given.items() if name is not None}
-        config = dataclasses.replace(config, data=dataclasses.replace(config.data, **files))
-    support = config.reconstruction.support
-    if support not in (None, "edges"):
-        section = dataclasses.replace(config.reconstruction, support=str((path.parent / support).resolve()))
-        config = dataclasses.replace(config, reconstruction=section)
+        raise ConfigError(f"{source}: {error}") from error
+    config = structure(values, Config, source)
+    if config.data is not None and not config.data.files:
+        raise ConfigError(f"{source}: missing key data.path")
     _warn_of_long_shears(config, path)
     return config
 
@@ -108,6 +101,8 @@ def _first_problem(error: Exception, where: str) -> str | None:
 def _describe(error: BaseException, _: Any) -> str:
     """An error in the words of the user's file, for cattrs, which adds " @ " and the key."""
     if isinstance(error, ForbiddenExtraKeysError):
+        if INCLUDE in error.extra_fields and error.cl is not Config:
+            return f"unknown key {INCLUDE}; it stands at the top of a file, before its first table"
         further = FURTHER.get(error.cl.__name__, ())
         name = min(error.extra_fields, key=lambda extra: (extra in further, extra))
         known = [*(f.name for f in dataclasses.fields(error.cl)), *further]

@@ -89,7 +89,10 @@ class WedgeSection:
 class DataSection:
     """The measured stack, and how it is brought to the model's unit; see `recon.recording.preparation.prepare`.
 
-    path: of the stack; a relative one starts from the configuration's folder.
+    path: of the stack, whose channels are the prisms; a relative one starts from the configuration's folder.
+    paths: instead of path, several files; their channels, one file after the other, are the prisms.
+    channels: which channel of the path each prism is, or which channel of each of the paths; counted from 0. None is
+        all of them in their order.
     flatten: whether each image is divided by its background; None does so for integer stacks only.
     scale: counts of an empty bright field, or "background" to find them from the images' background; None does so for
         integer stacks, and takes floats as relative to the empty bright field.
@@ -100,12 +103,15 @@ class DataSection:
     series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
         relative path starts from the configuration's folder. None is all pixels.
+    empty: an image or a stack of the empty field, by which the stack is divided in place of a fitted background, see
+        `recon.recording.empty_field`; a relative path starts from the configuration's folder. None is none.
     stuck: "auto" looks for pixels of the camera that are dead, hot or stuck at a value; None trusts them all.
-    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, and an order
-    or a series below 0.
+    Raises ValueError for a scale or a gain not above 0, a read noise below 0, an offset that isn't finite, an order, a
+    channel or a series below 0, both path and paths, channels that aren't as many as the paths, and an empty field
+    that nothing is to be divided by.
     """
 
-    path: str
+    path: str | None = None
     flatten: bool | None = None
     scale: float | Literal["background"] | None = None
     offset: float = 0.0
@@ -115,8 +121,27 @@ class DataSection:
     series: int | None = None
     mask: str | None = None
     stuck: Literal["auto"] | None = "auto"
+    paths: tuple[str, ...] | None = None
+    channels: tuple[int, ...] | None = None
+    empty: str | None = None
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of the stack; empty where none is named."""
+        return self.paths or (() if self.path is None else (self.path,))
 
     def __post_init__(self) -> None:
+        if self.path is not None and self.paths is not None:
+            raise ValueError("path and paths say the same: leave one out")
+        if self.empty is not None and self.flatten is False:
+            raise ValueError("empty divides the images, flatten = false says not to: leave one out")
+        if self.paths == ():
+            raise ValueError("paths must hold at least one file")
+        if self.channels is not None:
+            if len(self.files) > 1 and len(self.channels) != len(self.files):
+                raise ValueError(f"channels {list(self.channels)} must be as many as the {len(self.files)} paths")
+            if not self.channels or min(self.channels) < 0:
+                raise ValueError(f"channels {list(self.channels)} must be at least one, each at least 0")
         if self.gain is not None and not (0 < self.gain < math.inf):
             raise ValueError(f"gain {self.gain} must be above 0")
         if not (0 <= self.read_noise < math.inf):

@@ -10,20 +10,38 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from recon.config.media import index_of
+
 # Keys of a prism that are angles in rad, each of which may be given in degrees.
 ANGLES = ("bias", "polariser", "axis", "wedge")
 
 # What is appended to an angle's key where it is in degrees.
 DEGREES = "_degrees"
 
+# The keys of a layer that name its media, and what each stands for.
+_OF_LAYERS = {"depth": "thickness", "medium": "index", "design": "design_index"}
+
 # Further keys of a table, beside the fields of its dataclass, by the dataclass's name.
-_OF_PRISMS = tuple(f"{angle}{DEGREES}" for angle in ANGLES)
+_OF_PRISMS = (*(f"{angle}{DEGREES}" for angle in ANGLES), "file", "channel")
 FURTHER: dict[str, tuple[str, ...]] = {
+    "Config": ("include",),
     "VolumeSection": ("pixel_size", "slice_thickness"),
     "Prism": _OF_PRISMS,
     "CompensatorSection": _OF_PRISMS,
     "WedgeSection": _OF_PRISMS,
+    "Layer": tuple(_OF_LAYERS),
 }
+
+# Sets of keys that exclude each other because they say the same, by the key of their table.
+ALTERNATIVES: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
+    "": ((("tolerance",), ("fidelity",)),),
+    "volume": ((("spacing",), ("pixel_size", "slice_thickness")),),
+    "data": ((("path",), ("paths",)),),
+    "microscope.objective.layer": tuple(((old,), (new,)) for new, old in _OF_LAYERS.items()),
+}
+
+# The name by which a list of prisms holds bright field, which has none.
+BRIGHT_FIELD = "brightfield"
 
 Table = dict[str, Any]
 
@@ -38,8 +56,11 @@ def canonical(values: Mapping[str, Any]) -> Table:
     known = dict(values)
     if isinstance(known.get("volume"), dict):
         known["volume"] = _volume(known["volume"])
+    known = _with_layer(known)
     if isinstance(known.get("acquisition"), dict):
         known["acquisition"] = _acquisition(known["acquisition"])
+        if isinstance(known["acquisition"].get("prisms"), list):
+            known = _recordings(known, known["acquisition"]["prisms"])
     return known
 
 
@@ -82,6 +103,24 @@ def _volume(section: Table) -> Table:
     return {**others, "spacing": [_number(value, f"volume.{key}") for key, value in given]}
 
 
+def _with_layer(values: Table) -> Table:
+    """The values with the layer of the objective by thickness and indices, if there is one."""
+    microscope = values.get("microscope")
+    objective = microscope.get("objective") if isinstance(microscope, dict) else None
+    layer = objective.get("layer") if isinstance(objective, dict) else None
+    if not isinstance(microscope, dict) or not isinstance(objective, dict) or not isinstance(layer, dict):
+        return values
+    changed, key = dict(layer), "microscope.objective.layer"
+    for new, old in _OF_LAYERS.items():
+        if new not in layer:
+            continue
+        if old in layer:
+            raise ValueError(f"{key}.{old} and {key}.{new} say the same: leave one out")
+        read = _number if new == "depth" else index_of
+        changed[old] = read(changed.pop(new), f"{key}.{new}")
+    return {**values, "microscope": {**microscope, "objective": {**objective, "layer": changed}}}
+
+
 def _acquisition(section: Table) -> Table:
     """The focus as a list of planes, and each prism by its shear (y, x) and its angles in rad."""
     changed = dict(section)
@@ -108,8 +147,10 @@ def _planes(table: Table) -> list[float]:
     return [float(f"{start + number * width:.13g}") for number in range(count)]
 
 
-def _prism(table: Table, key: str) -> Table:
-    """A prism with its shear as (y, x) and its angles in rad."""
+def _prism(table: Table, key: str) -> Table | str:
+    """A prism with its shear as (y, x) and its angles in rad; bright field by its name."""
+    if table == {BRIGHT_FIELD: True}:
+        return BRIGHT_FIELD
     changed = dict(table)
     for angle in ANGLES:
         named = f"{angle}{DEGREES}"
@@ -126,6 +167,43 @@ def _prism(table: Table, key: str) -> Table:
         )
         changed["shear"] = list(direction(length, degrees))
     return changed
+
+
+def _recordings(values: Table, prisms: list[Any]) -> Table:
+    """The file and the channel of each prism's images as [data] lists them.
+
+    A table that says nothing but that it is bright field, and where its images are, becomes the name of bright field.
+    """
+    files, channels = (_of_each(prisms, key) for key in ("file", "channel"))
+    if files is None and channels is None:
+        return values
+    data = values.get("data", {})
+    if not isinstance(data, dict):
+        return values
+    for each, given, others in (("file", files, ("path", "paths")), ("channel", channels, ("channels",))):
+        for other in others:
+            if given is not None and other in data:
+                raise ValueError(f"data.{other} and acquisition.prisms[0].{each} say the same: leave one out")
+    bare = [_without_recording(prism) if isinstance(prism, dict) else prism for prism in prisms]
+    listed = {key: given for key, given in (("paths", files), ("channels", channels)) if given is not None}
+    return {**values, "acquisition": {**values["acquisition"], "prisms": bare}, "data": {**data, **listed}}
+
+
+def _of_each(prisms: list[Any], key: str) -> list[Any] | None:
+    """A key's value of each prism; None where no prism has it. Raises ValueError where some have it."""
+    having = [isinstance(prism, dict) and key in prism for prism in prisms]
+    if not any(having):
+        return None
+    if not all(having):
+        index = having.index(False)
+        hint = "" if isinstance(prisms[index], dict) else f", as in {{ brightfield = true, {key} = … }}"
+        raise ValueError(f"missing key acquisition.prisms[{index}].{key}: every prism has one, or none does{hint}")
+    return [prism[key] for prism in prisms]
+
+
+def _without_recording(prism: Table) -> Any:
+    bare = {key: value for key, value in prism.items() if key not in ("file", "channel")}
+    return BRIGHT_FIELD if bare == {BRIGHT_FIELD: True} else bare
 
 
 def _parts(table: Table, key: str, names: tuple[str, ...]) -> list[Any]:

@@ -78,7 +78,7 @@ _QUANTITIES = (
     _Plausible(rf"{_PRISM}({'|'.join(ANGLES)}|shear\.angle){DEGREES}", "angle of at most a turn", 0, 360, "°"),
     _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
     _Plausible(rf"{_PRISM}offset", "offset of a prism", 1e-4, 1e5),
-    _Plausible(r"microscope\.objective\.layer\.thickness", "thickness of a layer", 1e-3, 1e4),
+    _Plausible(r"microscope\.objective\.layer\.(thickness|depth)", "thickness of a layer", 1e-3, 1e4),
     _Plausible(r"fidelity\.reference_plane", "depth in a volume", 1e-4, 1e3),
     _Plausible(rf"{_PRISM}wedge", "angle of a wedge", 0, 1, "rad"),
     _Plausible(

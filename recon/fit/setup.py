@@ -56,11 +56,13 @@ class Setup:
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """The images' shape (prism, focus, y, x)."""
-        field, camera = self.field, self.microscope.camera
-        _, ny, nx = field.shape
-        _, dy, dx = field.spacing
-        rows, columns = (ny, nx) if camera is None else camera.pixels((ny, nx), (dy, dx))
+        _, rows, columns = self.pixels.shape
         return len(self.acquisition.prisms), len(self.acquisition.focus), rows, columns
+
+    @property
+    def pixels(self) -> Grid:
+        """The images' pixels as a grid (z, y, x): those of the camera, or the field's voxels."""
+        return pixels_of(self.field, self.microscope)
 
     def images(self, fidelity: Fidelity) -> Float[Tensor, "prism focus y x"]:
         """The images, relative to the empty bright field, as `torchdic.image`; differentiable."""
@@ -90,10 +92,11 @@ class Setup:
         within = slice(self.margin, -self.margin or None)
         return values[..., within, within]
 
-    def at_rest(self, data: Float[Tensor, "prism focus y x"]) -> Float[Tensor, "prism focus y x"]:
-        """Recorded images as they would be without the drift and of brightness 1, on pixels that are voxels."""
-        _, dy, dx = self.volume.grid.spacing
+    def at_rest(self, data: Float[Tensor, "prism focus row column"]) -> Float[Tensor, "prism focus y x"]:
+        """Recorded images as they would be without the drift and of brightness 1, on the field's voxels."""
+        _, dy, dx = self.pixels.spacing
         images = data if self.drift is None else shifted(data, -self.drift, (dy, dx))
+        images = images if self.sees_voxels else on_voxels(images, self.pixels, self.field)
         return images if self.brightness is None else images / self.brightness.to(images)[..., None, None]
 
     def _lit(self, images: Tensor) -> Tensor:
@@ -103,6 +106,45 @@ class Setup:
 def empty_medium(grid: Grid, background: float, like: Tensor) -> Volume:
     """A volume of Δn = 0 that takes no memory. background: the medium's index. like: gives the dtype and device."""
     return Volume(grid, like.new_zeros(()).expand(grid.shape), background)
+
+
+def pixels_of(field: Grid, microscope: Microscope) -> Grid:
+    """The pixels of a field's images as a grid (z, y, x): those of the camera, or the field's voxels.
+
+    Raises ValueError where no pixel of the camera fits into the field.
+    """
+    camera = microscope.camera
+    if camera is None or camera.pixel_size is None:
+        return field
+    (nz, ny, nx), (dz, dy, dx) = field.shape, field.spacing
+    return Grid((nz, *camera.pixels((ny, nx), (dy, dx))), (dz, *camera.pixel_spacing((dy, dx))))
+
+
+def on_voxels(
+    images: Float[Tensor, "prism focus row column"], pixels: Grid, field: Grid
+) -> Float[Tensor, "prism focus y x"]:
+    """Images on a field's voxels by cubic interpolation; beyond their outermost pixels' centres they go on.
+
+    pixels: theirs; both grids have the same centre. Images on finer pixels are sampled, not averaged.
+    """
+    rows, columns = (
+        _cubic(field.coordinates(axis, dtype=torch.float64), pixels.shape[axis], pixels.spacing[axis]).to(images)
+        for axis in (1, 2)
+    )
+    return rows @ images @ columns.mT
+
+
+def _cubic(places: Float[Tensor, " place"], count: int, side: float) -> Float[Tensor, "place pixel"]:
+    """The matrix that takes values at pixels' centres to values at places, µm (R. Keys, IEEE Trans. ASSP 29, 1153)."""
+    at = (places / side + (count - 1) / 2).clamp(0, count - 1)
+    matrix = places.new_zeros(len(places), count)
+    for away in range(-1, 3):
+        pixel = at.floor() + away
+        t = (at - pixel).abs()
+        weight = torch.where(t < 1, (1.5 * t - 2.5) * t**2 + 1, ((-0.5 * t + 2.5) * t - 4) * t + 2)
+        weight = torch.where(t < 2, weight, 0)
+        matrix.scatter_add_(1, pixel.clamp(0, count - 1).long()[:, None], weight[:, None])
+    return matrix
 
 
 def shifted(

@@ -70,10 +70,7 @@ class IndexDifference(Unknown):
     name = "delta"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:
-        """The parameter of the first volume, OFF_BOUNDS away from the bounds.
-
-        Raises ValueError for a linear start from images whose pixels aren't voxels.
-        """
+        """The parameter of the first volume, OFF_BOUNDS away from the bounds."""
         zero = misfit.data.new_zeros(()).expand(setup.volume.grid.shape)
         delta = _linear(setup, misfit) if self.first == "linear" else zero
         return self.bounds.parameter(delta, margin=OFF_BOUNDS)
@@ -89,11 +86,13 @@ class IndexDifference(Unknown):
 
 
 def _linear(setup: Setup, misfit: Misfit) -> Tensor:
-    """Δn of the weak specimen within the field; in the margin it goes on as at the field's edge."""
-    if not setup.sees_voxels:
-        raise ValueError("a linear start asks for images whose pixels are voxels, the camera has a pixel_size")
+    """Δn of the weak specimen within the field; in the margin it goes on as at the field's edge.
+
+    Images on a camera's pixels are interpolated: a start needs no more.
+    """
     data, margin = setup.at_rest(misfit.data), setup.margin
-    delta = linear_start(data, setup.field, setup.volume.background, setup.microscope, setup.acquisition)
+    microscope = setup.microscope if setup.sees_voxels else replace(setup.microscope, camera=None)
+    delta = linear_start(data, setup.field, setup.volume.background, microscope, setup.acquisition)
     return delta if margin == 0 else F.pad(delta[None], (margin,) * 4, mode="replicate")[0]
 
 

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real
 
 from recon.recording.background import background_surface, known_levels, noise_level
+from recon.recording.empty_field import EmptyField
 from recon.recording.masks import LeftOut, median_of_known, nearest_counted
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
@@ -38,6 +39,7 @@ class ExpectedStack:
     focus: one per plane, µm.
     pixel_size: (y, x) in µm, used in place of the file's; None uses the file's.
     pixels: (y, x), the number of pixels; None accepts any.
+    field: (y, x) in µm, of the volume that a camera sees with pixels of its own; None where pixels are voxels.
     empty: one per prism, the intensity of the empty field, relative to the empty bright field; None is what ideal
         polarisers give, sin²(bias/2), and 1 in bright field.
     """
@@ -47,6 +49,7 @@ class ExpectedStack:
     pixel_size: tuple[float, float] | None = None
     pixels: tuple[int, int] | None = None
     empty: tuple[float, ...] | None = None
+    field: tuple[float, float] | None = None
 
     @property
     def empty_levels(self) -> tuple[float, ...]:
@@ -62,8 +65,9 @@ class Normalisation:
         empty field below 1e-3) is stray light; it is subtracted and the expected empty field put in its place. None
         flattens integers and leaves floats as they are.
     scale: the pixel value, offset removed, of an empty bright field of which the objective stops no light; or
-        "background", which takes it from the background and the expected empty field. None is "background" for
-        integers and 1 for floats, which are relative to the empty bright field already.
+        "background", which takes it from the background and the expected empty field; an extinct prism then has the
+        scale of the others. None is "background" for integers and 1 for floats, which are relative to the empty bright
+        field already.
     offset: the camera's dark counts, in the file's unit, which are subtracted first.
     order: total degree of the polynomial that describes the background.
     """
@@ -139,6 +143,7 @@ def prepare(
     expected: ExpectedStack,
     normalisation: Normalisation | None = None,
     left_out: LeftOut | None = None,
+    empty_field: EmptyField | None = None,
 ) -> Measured:
     """Check a stack against the acquisition and bring it to the model's unit, the empty bright field.
 
@@ -147,11 +152,14 @@ def prepare(
     normalisation: how pixel values become intensities; None is `Normalisation()`, which flattens and scales integers
         by their background and leaves floats as they are.
     left_out: the pixels that don't count; nothing that is found in the images depends on them. None is none.
+    empty_field: by which the images are divided, and whose level is that of the empty background; None fits a
+        background to the images where the normalisation flattens.
 
     Raises StackError where the number of prisms, planes or pixels is not the expected one, no pixel size is known, the
-    scale should come from a background at extinction, or a background that divides the images is not above 0.
+    scale should come from backgrounds that are all extinct, or a background that divides the images is not above 0.
     Warns StackWarning where the file's sizes differ from the expected ones by more than 1 %, more than 1 % of the
-    pixels are saturated, or the background of floats isn't the expected one.
+    pixels are saturated, an extinct prism has the others' scale, the background of floats isn't the expected one, or
+    the empty field was recorded with another exposure.
     """
     normalisation = normalisation or Normalisation()
     _check_normalisation(stack, normalisation)
@@ -160,12 +168,18 @@ def prepare(
     _compare_focus(stack, expected.focus)
     _check_saturation(stack)
     levels, left_out = expected.empty_levels, left_out or LeftOut()
-    prepared = [
-        _in_model_unit(stack, prism, (bias, level), normalisation, left_out.counted)
-        for prism, (bias, level) in enumerate(zip(expected.biases, levels, strict=True))
-    ]
+    if empty_field is not None:
+        scale = "background" if normalisation.scale is None else normalisation.scale
+        normalisation = replace(normalisation, flatten=True, scale=scale)
+    found: dict[int, tuple[np.ndarray, PrismReport]] = {}
+    for prism in sorted(range(len(levels)), key=lambda prism: levels[prism] < _EXTINCT):  # which come last
+        dark, known = levels[prism] < _EXTINCT, [report.scale for _, report in found.values()]
+        how = _scaled_as(known, stack, prism, normalisation) if dark else normalisation
+        empty = expected.biases[prism], levels[prism]
+        found[prism] = _in_model_unit(stack, prism, empty, how, left_out.counted, empty_field)
+    prepared = [found[prism] for prism in range(len(levels))]
     reports = tuple(report for _, report in prepared)
-    if not stack.is_integer:
+    if not stack.is_integer and empty_field is None:
         _check_brightness(stack, reports, levels)
     return Measured(np.stack([images for images, _ in prepared]), expected.focus, pixel_size, reports, left_out)
 
@@ -176,10 +190,11 @@ def _in_model_unit(
     empty: tuple[float | None, float],
     normalisation: Normalisation,
     counted: Bool[np.ndarray, "prism focus y x"] | None,
+    by: EmptyField | None,
 ) -> tuple[Float[np.ndarray, "focus y x"], PrismReport]:
     """One prism's images relative to the empty bright field, float32. empty: its bias, and the empty field's intensity.
 
-    counted: the pixels that count; None is all.
+    counted: the pixels that count; None is all. by: the empty field by which they are divided, if any.
     """
     images, label, (bias, expected) = stack.data[prism], f"{stack.source}: prism {prism}", empty
     known = images if counted is None else np.where(counted[prism], images, np.nan)
@@ -192,8 +207,14 @@ def _in_model_unit(
             "too dark to scale by; give scale, the counts per empty bright field"
         )
     # the lamp does not change while the specimen moves through focus: one surface serves all planes
-    surface = background_surface(median_of_known(known) - offset, normalisation.order if flatten else 0)
-    level, lowest = float(surface.mean()), float(surface.min())
+    typical, noise = median_of_known(known) - offset, noise_level(known)
+    if by is None:
+        surface, more = background_surface(typical, normalisation.order if flatten else 0), 0.0
+    else:
+        surface, more = by.quiet(prism, None if noise is None else noise / abs(float(np.nanmedian(typical))))
+        surface = surface if is_extinct else _of_exposure(surface, typical, label, by.source)
+    level = float(surface.mean())
+    lowest = float(surface.min())
     if lowest <= 0 and (scale == "background" or (flatten and not is_extinct)):
         raise StackError(
             f"{label}'s background minus the offset {offset:g} falls to {lowest:.4g}; "
@@ -207,16 +228,54 @@ def _in_model_unit(
         if flatten:
             light = light - surface + expected * unit if is_extinct else light * (level / surface)
         scaled[plane] = light / unit
-    noise = noise_level(known)
     report = PrismReport(
         bias=bias,
         background=level,
         scale=unit,
         flicker=_flicker(known, offset),
         unevenness=float(np.ptp(surface)) / abs(level) if flatten and level else 0.0,
-        noise=None if noise is None else noise / unit,
+        noise=None if noise is None else math.hypot(noise, more) / unit,
     )
     return scaled, report
+
+
+def _scaled_as(scales: Sequence[float], stack: Stack, prism: int, normalisation: Normalisation) -> Normalisation:
+    """How an extinct prism is scaled where the background should tell: as the other prisms, whose scales are known."""
+    if not scales or normalisation.scale_of(stack) != "background":
+        return normalisation
+    scale = float(np.median(scales))
+    warnings.warn(
+        f"{stack.source}: prism {prism}'s empty field is dark and tells no scale: it is scaled as the other prisms, "
+        f"{scale:.4g} per empty bright field, which is right for one lamp and one exposure",
+        StackWarning,
+        stacklevel=3,
+    )
+    return replace(normalisation, scale=scale)
+
+
+def _of_exposure(
+    surface: Float[np.ndarray, "y x"], typical: Float[np.ndarray, "y x"], label: str, source: str
+) -> Float[np.ndarray, "y x"]:
+    """An empty field as bright as the stack's own background where the two were recorded with another exposure.
+
+    A specimen that fills the field moves the background, but not by that much.
+    """
+    ratio = float(background_surface(typical / surface, 0).mean())
+    if abs(ratio - 1) <= _LEVEL:
+        return surface
+    if ratio <= 0:
+        raise StackError(
+            f"{label}'s background is {ratio:.4g} of the empty field's ({source}): with the offset removed it must be "
+            "above 0"
+        )
+    level = float(surface.mean())
+    warnings.warn(
+        f"{label}'s background is {ratio * level:.4g}, the empty field's {level:.4g} ({source}), with the offset "
+        "removed: another exposure, lamp or bias; the empty field gives the shape alone, the stack its level",
+        StackWarning,
+        stacklevel=4,
+    )
+    return ratio * surface
 
 
 def _flicker(images: Real[np.ndarray, "focus y x"], offset: float) -> float | None:
@@ -250,9 +309,12 @@ def check_counts(stack: Stack, expected: ExpectedStack) -> None:
         )
     pixels = expected.pixels
     if pixels is not None and held[2:] != tuple(pixels):
-        raise StackError(
-            f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), the volume {pixels[0]} × {pixels[1]}"
-        )
+        volume, (ny, nx) = "the volume", pixels
+        if expected.field is not None and expected.pixel_size is not None:
+            height, width = expected.field
+            side = expected.pixel_size[0]
+            volume = f"the volume of {height:.4g} × {width:.4g} µm in whole pixels of the camera, of {side:.4g} µm,"
+        raise StackError(f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), {volume} {ny} × {nx}")
 
 
 def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tuple[float, float]:

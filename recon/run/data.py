@@ -8,7 +8,10 @@ from torch import Tensor
 
 from recon.config.schema import Config, ConfigError, DataSection
 from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.problem import DIRECT
+from recon.fit.setup import on_voxels, pixels_of
 from recon.misfit.base import spatial_variance
+from recon.recording.empty_field import EmptyField, empty_field
 from recon.recording.masks import LeftOut, counted_pixels, left_out
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
@@ -16,6 +19,7 @@ from recon.recording.support import edges_support
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
+from torchdic.files.joined import read_joined
 from torchdic.files.stack import read_stack
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
@@ -28,10 +32,11 @@ def load_data(config: Config) -> Measured:
     Raises ConfigError where the configuration has no stack or asks for what can't be reconstructed, and StackError
     where the file is no stack of its acquisition or shows nothing.
     """
-    if config.data is None:
+    section = config.data
+    if section is None or not section.files:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     check_feasible(config)
-    return prepared(config, read_stack(config.data.path, config.data.series))
+    return prepared(config, read_joined(section.files, section.channels, section.series))
 
 
 def prepared(config: Config, stack: Stack) -> Measured:
@@ -39,17 +44,24 @@ def prepared(config: Config, stack: Stack) -> Measured:
 
     Raises StackError where it is no stack of this acquisition or shows nothing.
     """
-    section = config.data or DataSection(stack.source)
+    section, pixels = config.data or DataSection(stack.source), camera_pixels(config)
     expected = ExpectedStack(
         biases=tuple(None if prism is None else float(prism.bias) for prism in config.acquisition.prisms),
         focus=tuple(float(focus) for focus in config.acquisition.focus),
-        pixel_size=config.volume.spacing[1:],
-        pixels=config.volume.shape[1:],
+        pixel_size=pixels.spacing[1:],
+        pixels=pixels.shape[1:],
+        field=config.volume.grid.extent[1:] if pixels is not config.volume.grid else None,
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
     check_counts(stack, expected)
-    measured = prepare(stack, expected, normalisation, _left_out(config, section, stack))
+    ratio = None
+    if section.stuck is not None:
+        ratio = sharpest(config.microscope, stack.pixel_size or pixels.spacing[1:], config.volume.background)
+    empty = None
+    if section.empty is not None:
+        empty = empty_field(read_stack(section.empty), stack, section.offset, ratio)
+    measured = prepare(stack, expected, normalisation, _left_out(section, stack, ratio, empty), empty)
     counted = measured.left_out.counted
     try:
         spatial_variance(torch.from_numpy(measured.data), None if counted is None else torch.from_numpy(counted))
@@ -58,13 +70,16 @@ def prepared(config: Config, stack: Stack) -> Measured:
     return measured
 
 
-def _left_out(config: Config, section: DataSection, stack: Stack) -> LeftOut:
-    """The pixels of a stack that don't count; a line says how many."""
+def _left_out(section: DataSection, stack: Stack, ratio: float | None, empty: EmptyField | None) -> LeftOut:
+    """The pixels of a stack that don't count; a line says how many.
+
+    ratio: how far a pixel may stand out of its neighbours; None looks for no stuck pixels. empty: has bad pixels too.
+    """
     mask = None if section.mask is None else read_stack(section.mask).data != 0
-    stuck = None
-    if section.stuck is not None:
-        ratio = sharpest(config.microscope, stack.pixel_size or config.volume.spacing[1:], config.volume.background)
-        stuck = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask))
+    stuck = None if empty is None else empty.bad
+    if ratio is not None:
+        own = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask, stuck))
+        stuck = own if stuck is None else own | stuck
     found = left_out(stack, mask, stuck)
     if str(found):
         print(found)
@@ -80,7 +95,9 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     if named is None:
         return None
     if named == "edges":
-        found = edges_support(measured.data, measured.focus, grid, config.microscope, config.volume.background)
+        pixels, images = camera_pixels(config), torch.from_numpy(measured.data)
+        data = measured.data if pixels == grid else on_voxels(images, pixels, grid).numpy()
+        found = edges_support(data, measured.focus, grid, config.microscope, config.volume.background)
     else:
         mask = read_stack(named).data != 0
         if mask.shape not in ((1, *grid.shape), (1, 1, *grid.shape[1:])):
@@ -93,20 +110,26 @@ def load_support(config: Config, measured: Measured) -> Tensor | None:
     return torch.from_numpy(found)
 
 
-def check_pixels(config: Config) -> None:
-    """Raise ConfigError where the camera's pixels aren't the volume's voxels."""
-    camera = config.microscope.camera
-    if camera is not None and camera.pixel_size is not None:
-        raise ConfigError(
-            f"microscope.camera.pixel_size: {camera.pixel_size} can be simulated; a reconstruction's pixels are its "
-            "volume's voxels"
-        )
+def camera_pixels(config: Config) -> Grid:
+    """The pixels of a configuration's images as a grid (z, y, x): the camera's, or the volume's voxels.
+
+    Raises ConfigError where none of the camera's fits into the volume.
+    """
+    try:
+        return pixels_of(config.volume.grid, config.microscope)
+    except ValueError as error:
+        raise ConfigError(f"microscope.camera.pixel_size: {error}") from error
 
 
 def check_feasible(config: Config) -> None:
     """Raise ConfigError where the configuration asks for something that a reconstruction doesn't have."""
-    check_pixels(config)
-    if config.reconstruction.method == "opl" and config.reconstruction.support is not None:
+    camera, method = config.microscope.camera, config.reconstruction.method
+    if method in DIRECT and camera is not None and camera.pixel_size is not None:
+        raise ConfigError(
+            f"reconstruction.method: {method!r} takes pixels that are voxels, microscope.camera.pixel_size is "
+            f"{camera.pixel_size:g}; use 'newton' or 'adam', or leave it out and give voxels the size of the pixels"
+        )
+    if method == "opl" and config.reconstruction.support is not None:
         raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
     section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
     if section.method in ("newton", "linear"):

@@ -126,7 +126,7 @@ def margin_of(config: Config, measured: Measured) -> int:
     section = config.reconstruction
     if section.margin != "auto":
         return section.margin
-    if section.method in DIRECT or min(config.volume.shape[1:]) < LEAST_FIELD:
+    if section.method in DIRECT or min(*config.volume.shape[1:], *measured.data.shape[2:]) < LEAST_FIELD:
         return 0
     scene = config.volume.grid, config.microscope, config.volume.background
     margin = needed_margin(measured.data, measured.noise, *scene)

@@ -134,7 +134,7 @@ def write_results(
             write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
 
     def draw_images() -> None:
-        figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, grid)
+        figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)
         figures.save(figures.headed(figure, verdict.words), out / "images.png")
 
     def draw_misfit() -> None:

@@ -88,6 +88,21 @@ class Camera:
             raise ValueError(f"a pixel of {side:g} µm doesn't fit into an image of {extent} µm")
         return count[0], count[1]
 
+    def passed(
+        self, shape: tuple[int, int], spacing: tuple[float, float], dtype: torch.dtype = torch.float64
+    ) -> Float[Tensor, "y half"]:
+        """What a pixel's mean leaves of each wave of an image: sinc(f_y·side)·sinc(f_x·side), 1 without a pixel size.
+
+        shape, spacing: of the image's voxels (y, x), µm. The waves are those of `torch.fft.rfft2`.
+        """
+        (ny, nx), (dy, dx) = shape, spacing
+        if self.pixel_size is None:
+            return torch.ones(ny, nx // 2 + 1, dtype=dtype)
+        side_y, side_x = self.pixel_spacing(spacing)
+        along_y = torch.sinc(side_y * torch.fft.fftfreq(ny, dy, dtype=torch.float64))
+        along_x = torch.sinc(side_x * torch.fft.rfftfreq(nx, dx, dtype=torch.float64))
+        return (along_y[:, None] * along_x).to(dtype)
+
     def integrate(
         self, intensity: Float[Tensor, "*image y x"], spacing: tuple[float, float], seen: tuple[int, int] | None = None
     ) -> Float[Tensor, "*image row column"]:

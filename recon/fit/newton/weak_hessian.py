@@ -5,6 +5,9 @@ image the Hessian of the misfit is, for each frequency f, the matrix A(z, z') = 
 cosines along z instead of slices (the DCT-II), for two reasons. Light sees no faster change along z than the difference
 of its axial frequencies, so a matrix of the lowest cosines holds all of A but its noise. And the differences along z,
 which the priors need, are diagonal in cosines.
+
+A camera's pixels that aren't voxels pass sinc(f·side) of each wave along y and x. Pixels coarser than half a wave also
+mix waves that look alike on them, which the matrices leave out: a descent's secants and its true gradient hold that.
 """
 
 import math
@@ -73,6 +76,10 @@ class WeakHessian:
         given = {"dtype": weights.dtype, "device": weights.device}
         T = transfer_functions(volume.grid, microscope, one, number(volume.background), fidelity, **given)[:, 0]
         T = T[..., : volume.grid.shape[2] // 2 + 1] * weights.sqrt()[:, None, None, None]
+        camera = setup.microscope.camera
+        if camera is not None and not setup.sees_voxels:
+            _, ny, nx = volume.grid.shape
+            T = T * camera.passed((ny, nx), volume.grid.spacing[1:], weights.dtype).to(weights.device)
         return T.permute(2, 3, 0, 1) @ self._cosines.mT.to(T.dtype)
 
     def spectrum(self, delta: Float[Tensor, "z y x"]) -> Complex[Tensor, "y half cosine"]:
