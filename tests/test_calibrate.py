@@ -24,7 +24,7 @@ TOLD = {
     "microscope": {"wavelength": 0.546, "objective": {"na": 0.8}, "condenser": {"na": 0.5}},
     "data": {"path": "stack.ome.tif", "offset": 100.0},
 }
-FEW = (("recon.calibration.orders.ROUNDS", ((16, 4, 2, 6), (2, 5, 3, 6))),)
+FEW = (("recon.calibration.trials.orders.ROUNDS", ((16, 4, 2, 6), (2, 5, 3, 6))),)
 
 
 def prisms(length, degrees, bias):

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from recon.calibration.declared import all_mistakes, images_of, one_mistake
-from recon.calibration.orders import find_orders
 from recon.calibration.part import part_of
+from recon.calibration.trials.declared import all_mistakes, images_of, one_mistake
+from recon.calibration.trials.orders import find_orders
 from recon.fit.problem import Problem, Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -107,7 +107,7 @@ WRONG = {
     "name", ["sign and focus", *(pytest.param(n, marks=pytest.mark.slow) for n in WRONG if n != "sign and focus")]
 )
 def test_the_race_finds_what_was_declared_wrongly(truth, name, monkeypatch):
-    monkeypatch.setattr("recon.calibration.orders.ROUNDS", ((8, 3, 2, 6), (2, 4, 3, 6)))
+    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", ((8, 3, 2, 6), (2, 4, 3, 6)))
     found = orders_of(truth, PAIR, WRONG[name])
     assert found.chosen.name == name
     assert images_of(found.chosen.acquisition) == images_of(PAIR)

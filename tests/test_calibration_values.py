@@ -9,7 +9,7 @@ import torch
 import recon.calibration.known_specimen as known
 from data_synthetic import Bead
 from recon.calibration.beside_volume import Beside, find_angles
-from recon.calibration.known_specimen import KnownSpecimen, find_optics, model_of
+from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
 from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.levels import biases_of_levels
 from recon.calibration.optics import (
@@ -21,7 +21,7 @@ from recon.calibration.optics import (
     axes_of,
 )
 from recon.calibration.part import part_of
-from recon.calibration.profile import least_misfit
+from recon.calibration.trials.profile import least_misfit
 from recon.fit.problem import Recipe
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
@@ -191,7 +191,7 @@ def optics_of_bead(seed, rounds, monkeypatch, biases=(75.0, -75.0)):
         data = bead_images(true, 20000.0, seed, place, (32, 30))
     told = Acquisition([Prism((0.04, 0.19), rad(b + math.copysign(6, b))) for b in biases], true.focus)
     part = part_of(data, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
-    specimen = KnownSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
+    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
     model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
     return find_optics(part, model, told, [0.005] * len(biases)), true
 
@@ -230,7 +230,7 @@ def test_a_specimen_that_is_not_there_is_told():
     bead = Bead(1.2, 0.06, 1.4)
     noise = 1 + 0.01 * torch.randn(1, 2, 32, 30, generator=torch.Generator().manual_seed(0))
     part = part_of(noise, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
-    specimen = KnownSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
+    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
     model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
     with pytest.raises(ValueError, match="the specimen isn't in the images"):
         find_optics(part, model, Acquisition([Prism((0.0, 0.2), 1.4)], (0.0, 1.0)), [0.01])

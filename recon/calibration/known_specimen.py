@@ -53,7 +53,7 @@ SURE = 6.0
 
 
 @dataclass(frozen=True)
-class KnownSpecimen:
+class ModelledSpecimen:
     """A specimen of known shape and index.
 
     delta: its Δn (z, y, x) on a grid about whose centre it lies. height, width: along z and across it, µm.
@@ -81,7 +81,7 @@ class OpticsFound:
     noise: float | None
 
 
-def model_of(part: Part, specimen: KnownSpecimen, background: float, microscope: Microscope) -> Setup:
+def model_of(part: Part, specimen: ModelledSpecimen, background: float, microscope: Microscope) -> Setup:
     """The specimen about the centre of a volume that is just as deep as it, in a field wider than the part's.
 
     A square pixel integrates over its area, as a camera's does. The acquisition is bright field, to be replaced.

@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from recon.calibration.known_specimen import KnownSpecimen, OpticsFound, find_optics, model_of
+from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
 from recon.calibration.optics import axes_of
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.run.calibration.found import FoundQuantity, Value, plain
@@ -25,7 +25,7 @@ UNSURE = math.radians(5)
 
 
 def by_bead(
-    stack: CalibrationStack, bead: KnownSpecimen, section: BeadSection
+    stack: CalibrationStack, bead: ModelledSpecimen, section: BeadSection
 ) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The stack with what its bead tells of the optics, and each quantity.
 

@@ -7,8 +7,8 @@ import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images
 from recon.calibration.optics import ShearOfAxes, axes_of
-from recon.calibration.profile import Least
-from recon.calibration.short_fits import can_be_tried
+from recon.calibration.trials.profile import Least
+from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
 from recon.run.calibration.found import FoundQuantity, left, plain
 from recon.run.calibration.stack import CalibrationStack
