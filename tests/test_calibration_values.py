@@ -196,6 +196,7 @@ def optics_of_bead(seed, rounds, monkeypatch, biases=(75.0, -75.0)):
     return find_optics(part, model, told, [0.005] * len(biases)), true
 
 
+@pytest.mark.slow
 def test_a_bead_tells_shear_bias_aperture_and_place(monkeypatch):
     found, true = optics_of_bead(0, ((8, 3), (20, 1)), monkeypatch, (75.0,))
     prism, right = found.setup.acquisition.prisms[0], true.prisms[0]
