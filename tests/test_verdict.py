@@ -6,7 +6,7 @@ import warnings
 import pytest
 import torch
 
-from recon.calibration.short_fits import can_be_tried
+from recon.calibration.trials.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from recon.calibration.optics import CondenserAperture, ShearOfAxes, axes_of
 from recon.calibration.part import Part
-from recon.calibration.profile import Least, least_misfit
-from recon.calibration.short_fits import coarse_steps
+from recon.calibration.trials.profile import Least, least_misfit
+from recon.calibration.trials.short_fits import coarse_steps
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.optics import (
     Aberrations,
     CondenserAperture,
@@ -27,7 +28,7 @@ from recon.fit.nuisances.base import Nuisance
 from recon.fit.nuisances.bias import Bias
 from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.nearby import Nearby, formed_together
-from recon.fit.nuisances.refinement import refined
+from recon.fit.nuisances.refinement import SCALE, refined
 from recon.fit.setup import Setup
 from recon.fit.unknowns import with_values
 from recon.misfit.base import Misfit
@@ -39,15 +40,20 @@ from torchdic.scalar import number
 # Thickness of a slab in µm, and the part of the field's width by which the model's is wider on each side.
 SLAB, MARGIN = 0.2, 0.2
 
-# Condenser directions of each round of steps; the last ones are the careful ones.
-ROUNDS = (16, 48, 112)
+# Condenser directions of each round, and how often the optics are refined in it at most: until no parameter moves by
+# more than STILL of its scale. Bias and shear lie in a long valley, along which each refinement goes a part of the way.
+ROUNDS = ((16, 4), (32, 10), (128, 4))
+STILL = 0.01
 
 # Depths at which the specimen is looked for, over the reach of the planes and of the volume.
 DEPTHS = 9
 
+# Noise alone correlates with the specimen's images by about 4 of its standard deviations at the best place.
+SURE = 6.0
+
 
 @dataclass(frozen=True)
-class KnownSpecimen:
+class ModelledSpecimen:
     """A specimen of known shape and index.
 
     delta: its Δn (z, y, x) on a grid about whose centre it lies. height, width: along z and across it, µm.
@@ -62,7 +68,8 @@ class KnownSpecimen:
 class OpticsFound:
     """What a known specimen tells.
 
-    values: by the unknown's name. parameters, deviations: their parameters, and one standard deviation of these.
+    values: by the unknown's name. parameters, deviations: their parameters, and one standard deviation of these: by the
+    images (`recon.calibration.uncertainty`), and how far they moved with the last condenser directions.
     setup: with all values in it. misfit: of its images. noise: what noise leaves of it; None where that isn't known.
     """
 
@@ -74,7 +81,7 @@ class OpticsFound:
     noise: float | None
 
 
-def model_of(part: Part, specimen: KnownSpecimen, background: float, microscope: Microscope) -> Setup:
+def model_of(part: Part, specimen: ModelledSpecimen, background: float, microscope: Microscope) -> Setup:
     """The specimen about the centre of a volume that is just as deep as it, in a field wider than the part's.
 
     A square pixel integrates over its area, as a camera's does. The acquisition is bright field, to be replaced.
@@ -86,7 +93,7 @@ def model_of(part: Part, specimen: KnownSpecimen, background: float, microscope:
     field = Grid((slabs, *part.grid.shape[1:]), (height / slabs, dy, dx))
     wide = field.widened(margin, margin)
     camera = Camera(pixel_size=dx) if math.isclose(dy, dx) else None
-    return Setup(
+    return UnevenSetup(
         Volume(wide, specimen.delta(wide).to(part.data), background),
         replace(microscope, camera=camera),
         Acquisition(),
@@ -111,14 +118,19 @@ def find_optics(
         for kind in (SamplingWarning, WrapAroundWarning):
             warnings.simplefilter("ignore", kind)
         parameters = {u.name: u.start(setup, misfit) for u in unknowns}
-        parameters |= _placed(setup, misfit, ROUNDS[0])
-        for number_of, sources in enumerate(ROUNDS):
-            if zernike and number_of == len(ROUNDS) - 2:
+        parameters |= _placed(setup, misfit, ROUNDS[0][0])
+        coarse = parameters
+        for sources, most in ROUNDS:
+            if zernike and len(parameters) == len(unknowns) and sources == ROUNDS[1][0]:
                 unknowns.append(Aberrations(tuple(zernike)))
                 parameters[unknowns[-1].name] = unknowns[-1].start(setup, misfit)
-            parameters = refined(unknowns, parameters, setup, misfit, Fidelity("wave", sources=sources))
-        nearby = Nearby(unknowns, parameters, setup, Fidelity("wave", sources=ROUNDS[-1]))
-        deviations = standard_deviations(nearby, parameters, misfit)
+            coarse = parameters
+            parameters = _settled(unknowns, parameters, setup, misfit, Fidelity("wave", sources=sources), most)
+        nearby = Nearby(unknowns, parameters, setup, Fidelity("wave", sources=ROUNDS[-1][0]))
+        deviations = {
+            name: (deviation.square() + (parameters[name] - coarse[name]).square()).sqrt()
+            for name, deviation in standard_deviations(nearby, parameters, misfit).items()
+        }
     values = {u.name: u.value(parameters[u.name]) for u in unknowns}
     return OpticsFound(
         values,
@@ -130,8 +142,33 @@ def find_optics(
     )
 
 
+def _settled(
+    unknowns: Sequence[Nuisance],
+    parameters: dict[str, Tensor],
+    setup: Setup,
+    misfit: Misfit,
+    fidelity: Fidelity,
+    most: int,
+) -> dict[str, Tensor]:
+    """The parameters after refinements until they hardly move, or `most` of them."""
+    for _ in range(most):
+        before = parameters
+        parameters = refined(unknowns, before, setup, misfit, fidelity)
+        moved = [float((parameters[u.name] - before[u.name]).abs().max()) / (SCALE * u.step) for u in unknowns]
+        if max(moved) < STILL:
+            break
+    return parameters
+
+
 def _unknowns(setup: Setup) -> list[Nuisance]:
-    found: list[Nuisance] = [Brightness(), Displacement(), FocusZero(), Bias(), ShearOfAxes(axes_of(setup.acquisition))]
+    found: list[Nuisance] = [
+        Brightness(),
+        Lamp(),
+        Displacement(),
+        FocusZero(),
+        Bias(),
+        ShearOfAxes(axes_of(setup.acquisition)),
+    ]
     condenser = setup.microscope.condenser
     if condenser is not None and number(condenser.na) > 0 and condenser.points is None:
         found.append(CondenserAperture(number(setup.volume.background)))
@@ -146,7 +183,7 @@ def _placed(setup: Setup, misfit: Misfit, sources: int) -> dict[str, Tensor]:
     zeros = [float(z) - middle for z in torch.linspace(-reach, reach, DEPTHS)] if len(focus) > 1 else [-middle]
     tried = [replace(setup, acquisition=replace(setup.acquisition, focus=[f + z for f in focus])) for z in zeros]
     formed = formed_together(tried, Fidelity("wave", sources=sources), planes=True)
-    best, found = 0.0, None
+    best, found = SURE, None
     for zero, images in zip(zeros, formed, strict=True):
         score, shift = _correlation(setup.recorded(images), misfit, setup.volume.grid.spacing[1:])
         if score > best:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from data_synthetic import Bead
-from recon.calibration.known_specimen import KnownSpecimen
+from recon.calibration.known_specimen import ModelledSpecimen
 from recon.config.reading import load
 from recon.config.schema import BeadSection, ConfigError
 from recon.run.calibration.calibrate import calibrate
@@ -23,11 +23,11 @@ def run(options: argparse.Namespace) -> None:
     calibrate(config, options.out, options.device, bead)
 
 
-def known_bead(section: BeadSection, background: float) -> KnownSpecimen:
+def known_bead(section: BeadSection, background: float) -> ModelledSpecimen:
     """The bead that a configuration names. background: index of its medium."""
     bead = Bead(section.radius, section.index - background, background)
 
     def delta(grid: Grid) -> Tensor:
         return bead.delta(grid, dtype=torch.float32)
 
-    return KnownSpecimen(delta, 2 * section.radius, 2 * section.radius)
+    return ModelledSpecimen(delta, 2 * section.radius, 2 * section.radius)

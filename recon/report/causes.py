@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.calibration.declared import images_of, one_mistake
-from recon.calibration.short_fits import short_fit
+from recon.calibration.trials.declared import images_of, one_mistake
+from recon.calibration.trials.short_fits import short_fit
 from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.calibration.short_fits import can_be_tried
+from recon.calibration.trials.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Row

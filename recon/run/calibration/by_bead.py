@@ -6,7 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from recon.calibration.known_specimen import KnownSpecimen, OpticsFound, find_optics, model_of
+from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
 from recon.calibration.optics import axes_of
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.run.calibration.found import FoundQuantity, Value, plain
@@ -20,9 +20,12 @@ PLANES, AROUND = 7, 3.5
 # A fit that leaves more than this many times the noise's misfit, and this share of the contrast, isn't explained.
 POOR, LEAST = 1.5, 0.02
 
+# A bias that is as uncertain as this, in rad, is said to be.
+UNSURE = math.radians(5)
+
 
 def by_bead(
-    stack: CalibrationStack, bead: KnownSpecimen, section: BeadSection
+    stack: CalibrationStack, bead: ModelledSpecimen, section: BeadSection
 ) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The stack with what its bead tells of the optics, and each quantity.
 
@@ -76,22 +79,22 @@ def _plain_prism(prism: Prism) -> Prism:
 
 def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> list[FoundQuantity]:
     """Each quantity that a bead tells."""
-    how = _how(found)
+    how, whole = "by the bead", _how(found)
     declared = config.acquisition.prisms
     sheared = [i for i, prism in enumerate(declared) if prism is not None]
     biases = [number(prism.bias) for prism in declared if prism is not None]
-    made = [_of("bias", "rad", biases, found.values["bias"][sheared], found.deviations["bias"][sheared], how)]
+    made = [_of("bias", "rad", biases, found.values["bias"][sheared], found.deviations["bias"][sheared], whole)]
     made += _shears(config, found, how)
     if "condenser" in found.values:
         assert config.microscope.condenser is not None
         before = number(config.microscope.condenser.na)
         na, sure = (before * found.values["condenser"] * part for part in (1.0, found.deviations["condenser"]))
         made.append(_of("condenser na", "", before, na, sure, how))
-    where = f"{how}; the bead lies there. The planes stay as told, because focus against z is a gauge"
+    where = f"{how}; the planes stay as told, because focus against z is a gauge"
     made.append(_of("bead's z", "µm", None, -found.values["focus_zero"], found.deviations["focus_zero"], where))
     drift, lit = found.values["drift"], found.values["brightness"]
     moved = drift - drift.mean((0, 1))
-    of = f"of planes {', '.join(map(str, planes))} (from 0); {how}"
+    of = f"{how}, of planes {', '.join(map(str, planes))} (from 0)"
     made.append(_of("drift", "µm", None, moved, found.deviations["drift"], of))
     made.append(_of("brightness", "", None, lit, found.deviations["brightness"] * lit, of))
     if "aberrations" in found.values:
@@ -137,10 +140,12 @@ def _shears(config: Config, found: OpticsFound, how: str) -> list[FoundQuantity]
 
 
 def _how(found: OpticsFound) -> str:
-    how = "the bead's images"
+    how = "by the bead"
     if found.noise:
         ratio = found.misfit / found.noise
         how += f", misfit {ratio:.2f} × the noise's"
+        if float(found.deviations["bias"].max()) > UNSURE:
+            how += "; bias and shear's length are uncertain together, a bead of more contrast tells more"
         if ratio > POOR and found.misfit - found.noise > LEAST:
             how += ": they aren't explained; check the bead's radius and index, the medium's, wavelength and NA"
     return how

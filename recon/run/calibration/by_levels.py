@@ -22,7 +22,8 @@ def by_levels(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuan
     planes = len(config.acquisition.focus)
     relative = [math.hypot(LEAST, (report.flicker or 0.0) / math.sqrt(planes)) for report in reports]
     found = biases_of_levels(declared, [report.background for report in reports], relative)
-    how = f"the levels of {len(prisms)} backgrounds, recorded with one exposure"
+    of = "of the empty field" if config.data is not None and config.data.empty is not None else "of backgrounds"
+    how = f"{len(prisms)} levels {of}, recorded with one exposure"
     before = [bias for bias in declared if bias is not None]
     if all(told for told, bias in zip(found.told, declared, strict=True) if bias is not None):
         biases = found.biases

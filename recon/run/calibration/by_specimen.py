@@ -7,8 +7,8 @@ import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images
 from recon.calibration.optics import ShearOfAxes, axes_of
-from recon.calibration.profile import Least
-from recon.calibration.short_fits import can_be_tried
+from recon.calibration.trials.profile import Least
+from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
 from recon.run.calibration.found import FoundQuantity, left, plain
 from recon.run.calibration.stack import CalibrationStack
@@ -24,6 +24,12 @@ UNSURE_ANGLE, UNSURE_APERTURE = math.radians(5), 0.1
 # Where the best volume leaves more than this many times what noise does, and this share of the contrast, what it
 # doesn't explain would be put down to the aperture.
 POOR, LEAST = 1.3, 0.03
+
+# What slabs, directions and priors move the aperture's logarithm and the angle by, as measured on known scenes.
+MODEL_APERTURE, MODEL_ANGLE = 0.05, math.radians(0.5)
+
+# A value within so many standard deviations of what was told agrees with it.
+AGREES = 2.0
 
 SCALE = "it sets the scale of Δn: with an unknown specimen another Δn explains the images as well; use a bead"
 
@@ -76,7 +82,7 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
         return stack, left(name, unit, told, why)
     turned = torch.tensor([[1.0, least.value] for least in found], dtype=torch.float64)
     values = [float(f"{t + least.value:.5g}") for t, least in zip(told, found, strict=True)]
-    sure = [float(f"{least.deviation:.2g}") for least in found]
+    sure = [float(f"{math.hypot(least.deviation, MODEL_ANGLE):.2g}") for least in found]
     how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from +x towards +y (down)"
     acquisition = _rounded(
         ShearOfAxes(axes).put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
@@ -97,11 +103,15 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
     if lowest > POOR * alone and lowest - alone > LEAST:
         why = f"the best volume leaves {lowest / alone:.1f} × what noise does" if alone > 0 else "the fit is poor"
         return stack, [left(name, "", before, f"{why}, which would be put down to it")]
-    if found.deviation > UNSURE_APERTURE:
+    deviation = math.hypot(found.deviation, MODEL_APERTURE)
+    if deviation > UNSURE_APERTURE:
         return stack, [left(name, "", before, "volumes explain the images as well with other apertures")]
     na = float(f"{before * math.exp(found.value):.4g}")
-    sure = float(f"{na * found.deviation:.2g}")
+    sure = float(f"{na * deviation:.2g}")
     how = f"volumes fitted with {_tried([found])} apertures, misfit {_best([found], beside)}"
+    if abs(found.value) < AGREES * deviation:
+        how += "; it agrees with what was told, which stays"
+        return stack, [FoundQuantity(name, "", before, na, sure, how)]
     microscope = replace(config.microscope, condenser=replace(condenser, na=na))
     quantity = FoundQuantity(name, "", before, na, sure, how)
     return stack.with_config(replace(config, microscope=microscope)), [quantity]

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import torch
 
-from recon.calibration.known_specimen import KnownSpecimen
-from recon.calibration.orders import Orders
+from recon.calibration.known_specimen import ModelledSpecimen
+from recon.calibration.trials.orders import Orders
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.fit.bounds import Bounds
 from recon.run.calibration.by_bead import by_bead
@@ -34,7 +34,7 @@ class Calibration:
     found: tuple[FoundQuantity, ...]
 
 
-def calibrate(config: Config, out: Path, device: torch.device, bead: KnownSpecimen | None = None) -> Calibration:
+def calibrate(config: Config, out: Path, device: torch.device, bead: ModelledSpecimen | None = None) -> Calibration:
     """Find what the stack's images tell of the optics, and leave calibrated.toml and calibration.json in a folder.
 
     bead: the one that [calibration] names, where it names one. A line is printed for each quantity, and a table of the

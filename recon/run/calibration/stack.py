@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from recon.calibration.beside_volume import Beside
-from recon.calibration.orders import Orders, find_orders
 from recon.calibration.part import PIXELS, PLANES, SLICES, Part, part_of
-from recon.calibration.short_fits import can_be_tried
+from recon.calibration.trials.orders import Orders, find_orders
+from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
 from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem, Recipe

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from recon.calibration.orders import Orders
+from recon.calibration.trials.orders import Orders
 from recon.config.conversion import dump, dump_microscope
 from recon.config.schema import CalibrationSection, Config
 from recon.run.calibration.found import FoundQuantity

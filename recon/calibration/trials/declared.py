@@ -130,7 +130,8 @@ def all_mistakes(declared: Acquisition) -> list[Otherwise]:
             steps.append(_reversed(steps[-1].acquisition if steps else declared))
         found.append(_together(declared, steps))
     distinct: dict[object, Otherwise] = {}
-    for other in sorted(found, key=lambda other: other.mistakes):
+    # among equals a sign or an axis is the plainer mistake than exchanged prisms
+    for other in sorted(found, key=lambda other: (other.mistakes, "prisms" in other.name)):
         distinct.setdefault(images_of(other.acquisition), other)
     return list(distinct.values())
 

@@ -11,8 +11,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from recon.calibration.declared import Otherwise, all_mistakes, images_of
-from recon.calibration.short_fits import coarse_steps
+from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
+from recon.calibration.trials.short_fits import coarse_steps
 from recon.fit.problem import Problem, Recipe
 from recon.fit.step import Step
 from torchdic import Acquisition
@@ -70,7 +70,7 @@ class Orders:
 
 
 def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, noise: Sequence[float] | None) -> Orders:
-    """Try all that `recon.calibration.declared` names.
+    """Try all that `recon.calibration.trials.declared` names.
 
     declared: the whole stack's acquisition. problem_of: see `ProblemOf`. recipe: with bounds and a prior.
     noise: standard deviation of each prism's; None where it isn't known.

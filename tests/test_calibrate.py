@@ -1,0 +1,138 @@
+"""torchdic calibrate, from a file to a folder."""
+
+import json
+import math
+import tomllib
+
+import pytest
+import tomli_w
+import torch
+
+from data_synthetic import Bead
+from recon.cli import main
+from recon.config import load
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+from torchdic.files.stack import write_stack
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning"),
+    pytest.mark.filterwarnings("ignore::torchdic.errors.StackWarning"),
+]
+FOCUS = [-1.2, 0.0, 1.2]
+TOLD = {
+    "volume": {"shape": [8, 40, 36], "spacing": [0.5, 0.2, 0.2], "background": 1.4},
+    "microscope": {"wavelength": 0.546, "objective": {"na": 0.8}, "condenser": {"na": 0.5}},
+    "data": {"path": "stack.ome.tif", "offset": 100.0},
+}
+FEW = (("recon.calibration.trials.orders.ROUNDS", ((16, 4, 2, 6), (2, 5, 3, 6))),)
+
+
+def prisms(length, degrees, bias):
+    angle = math.radians(degrees)
+    return [{"shear": [length * math.sin(angle), length * math.cos(angle)], "bias": b} for b in (bias, -bias)]
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """A bead's counts, with a bias of ±1.3, a shear of 0.2 µm at 20°."""
+    fine = Grid((10, 80, 72), (0.24, 0.1, 0.1))
+    bead = Bead(1.2, 0.05, 1.4, (0.1, 0.3, -0.4))
+    acquisition = Acquisition([Prism(tuple(p["shear"]), p["bias"]) for p in prisms(0.2, 20, 1.3)], FOCUS)
+    volume = Volume(fine, bead.delta(fine, dtype=torch.float32), 1.4)
+    with torch.no_grad():
+        images = image(volume, Microscope(0.546, Objective(0.8), Condenser(0.5)), acquisition, Fidelity(sources=24))
+    pixels = Camera(pixel_size=0.2).integrate(images, (0.1, 0.1))
+    camera = Camera(photons=10000, read_noise=2.0, gain=2.0, offset=100.0, bits=16)
+    return camera.record(pixels, torch.Generator().manual_seed(0))
+
+
+def calibrated(folder, recorded, monkeypatch, told, patches=FEW):
+    """Run the command; the exit code, the calibrated configuration and the record."""
+    for name, value in patches:
+        monkeypatch.setattr(name, value)
+    write_stack(folder / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    (folder / "run.toml").write_text(tomli_w.dumps({**TOLD, **told}), encoding="utf-8")
+    code = main(["calibrate", str(folder / "run.toml"), "--out", str(folder / "out"), "--device", "cpu"])
+    assert code == 0
+    return load(folder / "out" / "calibrated.toml"), json.loads((folder / "out" / "calibration.json").read_text())
+
+
+def test_a_bead_leaves_a_microscope_to_be_reused(tmp_path, recorded, monkeypatch, capsys):
+    told = {
+        "acquisition": {"focus": FOCUS, "prisms": prisms(0.22, 26, 1.4)},  # too long, turned, too much
+        "calibration": {"bead": {"radius": 1.2, "index": 1.45}},
+    }
+    patches = (
+        ("recon.calibration.known_specimen.ROUNDS", ((6, 3), (8, 1))),
+        ("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None),
+    )
+    config, record = calibrated(tmp_path, recorded, monkeypatch, told, patches)
+    assert not record["signs and orders"]["found"]
+    shear = config.acquisition.prisms[0].shear
+    assert math.degrees(math.atan2(*shear)) == pytest.approx(20, abs=3)
+    for name in ("bias", "shear's length", "shear's angle", "condenser na", "bead's z", "brightness", "drift"):
+        assert {"value", "uncertainty", "how", "before"} <= set(record[name]), name
+    assert record["shear's length"]["before"] == pytest.approx([0.22])
+    assert "focus against z" in " ".join(record["not told by any image"])
+    said = capsys.readouterr().out
+    assert "shear and bias reversed together" in said
+    # another stack's configuration takes the optics from it
+    other = {**TOLD, "include": "out/microscope.toml", "acquisition": {"focus": [0.0]}}
+    del other["microscope"]
+    (tmp_path / "cell.toml").write_text(tomli_w.dumps(dict(sorted(other.items(), key=lambda i: i[0] != "include"))))
+    assert load(tmp_path / "cell.toml").acquisition.prisms[0].shear == pytest.approx(shear)
+    assert set(tomllib.loads((tmp_path / "out" / "microscope.toml").read_text())) == {"microscope", "acquisition"}
+
+
+@pytest.mark.slow
+def test_an_unknown_specimen_tells_direction_and_leaves_what_sets_the_scale(tmp_path, recorded, monkeypatch, capsys):
+    told = {"acquisition": {"focus": FOCUS[::-1], "prisms": prisms(0.2, 14, 1.3)}}
+    config, record = calibrated(tmp_path, recorded, monkeypatch, told)
+    assert record["signs and orders"]["value"] == "focus"
+    assert [float(f) for f in config.acquisition.focus] == FOCUS
+    assert math.degrees(record["shear's angle"]["value"][0]) == pytest.approx(20, abs=3)
+    for name in ("shear's length", "bias"):
+        assert not record[name]["found"]
+        assert "scale of Δn" in record[name]["how"]
+    assert "gauge" in record["focus zero"]["how"]
+    assert not (tmp_path / "out" / "microscope.toml").exists()
+    said = capsys.readouterr().out
+    assert "left as told" in said
+    assert "misfit / noise" in said
+
+
+@pytest.mark.parametrize(
+    ("section", "law"),
+    [
+        ({"bead": {"radius": 0.0, "index": 1.5}}, "radius 0.0 must be above 0"),
+        ({"bead": {"radius": 1.0, "index": 1.4}}, "index 1.4 is the medium's"),
+        ({"bead": {"radius": 1.0, "index": 0.9}}, "index 0.9 must be a refractive index"),
+        ({"aberrations": [11]}, "give bead too"),
+        ({"bead": {"radius": 1.0, "index": 1.5}, "aberrations": [4]}, "defocus is where the bead lies"),
+        ({"bead": {"radius": 1.0, "index": 1.5}, "aberrations": [5, 5]}, "names one twice"),
+        ({"bead": {"radius": 1.0}}, "missing key calibration.bead.index"),
+        ({"bead": {"radius": 30.0, "index": 1.5}}, "too large for a field"),
+    ],
+)
+def test_what_cannot_be_a_bead_is_refused_in_one_line(tmp_path, recorded, monkeypatch, capsys, section, law):
+    monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None)
+    write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    told = {**TOLD, "acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}, "calibration": section}
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert law in said
+
+
+def test_levels_of_one_exposure_tell_the_compensators_zero(tmp_path, recorded, monkeypatch):
+    """The pair was recorded at −1.3 and 1.3; told as −1.2 and 1.4 it has a zero of −0.1."""
+    monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None)
+    monkeypatch.setattr("recon.run.calibration.calibrate.by_specimen", lambda stack, _: (stack, []))
+    shear = prisms(0.2, 20, 1.3)[0]["shear"]
+    told = {
+        "acquisition": {"focus": FOCUS, "prisms": [{"shear": shear, "bias": b} for b in (1.4, -1.2)]},
+        "calibration": {"one_exposure": True},
+    }
+    config, record = calibrated(tmp_path, recorded, monkeypatch, told)
+    assert record["compensator's zero"]["value"] == pytest.approx(-0.1, abs=0.03)
+    assert float(config.acquisition.prisms[0].bias) == pytest.approx(1.3, abs=0.03)

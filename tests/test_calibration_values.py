@@ -1,0 +1,255 @@
+"""Values of a calibration: from levels, from a known specimen and from trials; each within its uncertainty."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import recon.calibration.known_specimen as known
+from data_synthetic import Bead
+from recon.calibration.beside_volume import Beside, find_angles
+from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
+from recon.calibration.lamp import Lamp, UnevenSetup
+from recon.calibration.levels import biases_of_levels
+from recon.calibration.optics import (
+    Aberrations,
+    CondenserAperture,
+    Displacement,
+    FocusZero,
+    ShearOfAxes,
+    axes_of,
+)
+from recon.calibration.part import part_of
+from recon.calibration.trials.profile import least_misfit
+from recon.fit.problem import Recipe
+from recon.misfit.gaussian import GaussianMisfit
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+
+pytestmark = pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
+rad = math.radians
+
+
+# --- levels -----------------------------------------------------------------------------------------------------------
+
+
+def levels(*biases, lamp=3000.0, leak=0.002):
+    return [lamp * ((1.0 if b is None else math.sin(rad(b) / 2) ** 2) + leak) for b in biases]
+
+
+def found_biases(declared, true):
+    told = [None if b is None else rad(b) for b in declared]
+    return biases_of_levels(told, levels(*true), [0.004] * len(true))
+
+
+@pytest.mark.parametrize(
+    ("declared", "true"),
+    [((60, None), (70, None)), ((60, -60, None), (72, -66, None)), ((30, 60, 90), (33, 66, 99))],
+)
+def test_a_bright_field_or_several_settings_tell_the_biases(declared, true):
+    found = found_biases(declared, true)
+    for bias, deviation, told, right in zip(found.biases, found.deviations, found.told, true, strict=True):
+        if right is None:
+            assert bias is None
+            continue
+        assert told
+        assert abs(bias - rad(right)) < 3 * deviation
+        assert abs(bias - rad(right)) < rad(2)
+
+
+def test_a_pair_of_opposite_bias_tells_the_zero_alone():
+    found = found_biases((90, -90), (96, -84))
+    assert found.told == (False, False)
+    assert found.zero == pytest.approx(rad(6), abs=3 * found.zero_deviation)
+    assert found.zero_deviation < rad(1.5)
+
+
+def test_one_setting_tells_nothing():
+    found = found_biases((90,), (80,))
+    assert found.told == (False,)
+    assert found.zero_deviation > rad(10)
+
+
+def test_unequal_levels_are_refused():
+    with pytest.raises(ValueError, match="level 0 must be above 0"):
+        biases_of_levels([1.0], [0.0], [0.01])
+    with pytest.raises(ValueError, match="2 biases, 1 levels"):
+        biases_of_levels([1.0, 2.0], [1.0], [0.01])
+
+
+# --- trials -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_least_of_a_parabola_is_found_wherever_it_lies():
+    for true in (-0.3, 0.02, 0.31):
+        found = least_misfit(lambda v, t=true: np.full(4, 0.1 + (v - t) ** 2), 0.0, 0.12, 0.1, 1000, (-1, 1))
+        assert found.value == pytest.approx(true, abs=1e-9)
+        assert found.deviation == pytest.approx(math.sqrt(0.1 / 1000), rel=0.1)  # σ² = noise over curvature and pixels
+
+
+def test_images_that_disagree_make_the_least_uncertain():
+    places = np.array([-0.05, 0.05, 0.02, -0.02])
+    found = least_misfit(lambda v: 0.1 + (v - places) ** 2, 0.0, 0.12, 0.1, 10**9, (-1, 1))
+    assert found.value == pytest.approx(0.0, abs=1e-9)
+    assert found.deviation == pytest.approx(places.std(ddof=1) / 2, rel=1e-6)  # the error of a mean of four
+
+
+def test_a_misfit_without_a_least_within_the_limits_tells_nothing():
+    assert least_misfit(lambda v: np.array([0.1 + 0.01 * v]), 0.0, 0.12, 0.1, 100, (-1, 1)).deviation == math.inf
+
+
+# --- unknowns ---------------------------------------------------------------------------------------------------------
+
+GRID = Grid((3, 16, 18), (0.5, 0.2, 0.2))
+PRISMS = [Prism((0.0, 0.2), 1.2), Prism((0.2, 0.0), 1.2), Prism((0.0, -0.2), 1.0)]
+
+
+def small_setup():
+    z, y, x = (
+        (torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * d for n, d in zip(GRID.shape, GRID.spacing, strict=True)
+    )
+    delta = 0.02 * torch.exp(-(z[:, None, None] ** 2 + (y[:, None] + 0.3) ** 2 + (x - 0.2) ** 2) / 0.5)
+    microscope = Microscope(0.546, Objective(0.8), Condenser(0.5))
+    return UnevenSetup(Volume(GRID, delta, 1.4), microscope, Acquisition(PRISMS, (-0.4, 0.5)))
+
+
+UNKNOWNS = [
+    ShearOfAxes(axes_of(Acquisition(PRISMS))),
+    FocusZero(),
+    Displacement(),
+    Aberrations((5, 7, 11)),
+    Lamp(),
+]
+
+
+@pytest.mark.parametrize("unknown", UNKNOWNS, ids=lambda u: u.name)
+def test_gradients_are_those_of_differences(unknown):
+    setup, few = small_setup(), Fidelity("wave", sources=3)
+    with torch.no_grad():
+        data = setup.images(few)
+    misfit = GaussianMisfit(data)
+    start = unknown.start(setup, misfit)
+    random = torch.Generator().manual_seed(3)
+    weight = torch.randn(data.shape, generator=random, dtype=torch.float64)
+    here = start + 0.3 * unknown.step * torch.randn(start.shape, generator=random, dtype=torch.float64)
+    toward = torch.randn(start.shape, generator=random, dtype=torch.float64)
+
+    def value(parameter):
+        return (weight * unknown.put(unknown.value(parameter), setup).images(few)).sum()
+
+    leaf = here.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(value(leaf), leaf)
+    step = 1e-5
+    with torch.no_grad():
+        difference = (value(here + step * toward) - value(here - step * toward)) / (2 * step)
+    # central differences: relative error of step²
+    assert float((gradient * toward).sum()) == pytest.approx(float(difference), rel=1e-5, abs=1e-8)
+
+
+@pytest.mark.parametrize("unknown", UNKNOWNS[:1] + UNKNOWNS[4:], ids=lambda u: u.name)
+def test_an_entry_acts_on_the_images_that_it_says(unknown):
+    setup, few = small_setup(), Fidelity("wave", sources=3)
+    with torch.no_grad():
+        before = setup.images(few)
+        start = unknown.start(setup, GaussianMisfit(before))
+        acting = unknown.acting(start, (3, 2)).abs().sum(2) > 0
+        for entry in range(start.numel()):
+            moved = start.clone()
+            moved.view(-1)[entry] += unknown.step
+            changed = unknown.put(unknown.value(moved), setup).images(few) - before
+            seen = changed.abs().amax((2, 3)) > 1e-12
+            assert torch.equal(seen, acting[:, :, entry])
+
+
+def test_prisms_whose_shears_differ_by_their_sign_share_an_axis():
+    assert axes_of(Acquisition([None, *PRISMS])) == (0, 0, 1, 0)
+
+
+def test_a_condenser_never_exceeds_what_the_medium_lets_pass():
+    setup = small_setup()
+    wide = CondenserAperture(1.4).put(torch.tensor(10.0), setup)
+    assert wide.microscope.condenser.na == pytest.approx(1.4)
+
+
+# --- a known specimen -------------------------------------------------------------------------------------------------
+
+
+def bead_images(true, photons, seed, bead, field):
+    """A bead's images on pixels that integrate, from voxels of half the size and twice as many slabs."""
+    fine = Grid((16, 2 * (field[0] + 20), 2 * (field[1] + 20)), (0.2, 0.1, 0.1))
+    volume = Volume(fine, bead.delta(fine, dtype=torch.float32), bead.background)
+    images = image(volume, Microscope(0.546, Objective(0.8), Condenser(0.5)), true, Fidelity(sources=40))
+    pixels = Camera(pixel_size=0.2).integrate(images, (0.1, 0.1), (2 * field[0], 2 * field[1]))
+    return Camera(photons=photons).record(pixels, torch.Generator().manual_seed(seed))
+
+
+def optics_of_bead(seed, rounds, monkeypatch, biases=(75.0, -75.0)):
+    monkeypatch.setattr(known, "ROUNDS", rounds)
+    bead, place = Bead(1.2, 0.06, 1.4), Bead(1.2, 0.06, 1.4, (0.1, 0.3, -0.4))
+    true = Acquisition([Prism((0.06, 0.18), rad(b)) for b in biases], (-1.5, 0.0, 1.5))
+    with torch.no_grad():
+        data = bead_images(true, 20000.0, seed, place, (32, 30))
+    told = Acquisition([Prism((0.04, 0.19), rad(b + math.copysign(6, b))) for b in biases], true.focus)
+    part = part_of(data, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
+    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
+    model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
+    return find_optics(part, model, told, [0.005] * len(biases)), true
+
+
+@pytest.mark.slow
+def test_a_bead_tells_shear_bias_aperture_and_place(monkeypatch):
+    found, true = optics_of_bead(0, ((8, 3), (20, 1)), monkeypatch, (75.0,))
+    prism, right = found.setup.acquisition.prisms[0], true.prisms[0]
+    length = math.hypot(*map(float, prism.shear)) / math.hypot(*right.shear)
+    angle = math.atan2(*map(float, prism.shear)) - math.atan2(*right.shear)
+    errors = {
+        "bias": (float(prism.bias) - right.bias, float(found.deviations["bias"][0]), rad(6)),
+        "length": (math.log(length), float(found.deviations["shear"][0, 0]), 0.08),
+        "angle": (angle, float(found.deviations["shear"][0, 1]), rad(3)),
+        "focus": (float(found.values["focus_zero"]) + 0.1, float(found.deviations["focus_zero"]), 0.1),
+    }
+    for name, (error, deviation, most) in errors.items():
+        assert abs(error) < most, name
+        assert abs(error) < 4 * deviation, name
+    assert found.values["drift"].mean((0, 1)).tolist() == pytest.approx([0.3, -0.4], abs=0.03)
+    assert found.setup.microscope.condenser.na == pytest.approx(0.5, rel=0.04)
+    assert found.misfit < 1.2 * found.noise
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_errors_of_a_bead_are_within_three_deviations(monkeypatch, seed):
+    found, true = optics_of_bead(seed, known.ROUNDS, monkeypatch)
+    for index, right in enumerate(true.prisms):
+        prism = found.setup.acquisition.prisms[index]
+        assert abs(float(prism.bias) - right.bias) < min(3 * float(found.deviations["bias"][index]), rad(3))
+    length = math.hypot(*map(float, prism.shear)) / math.hypot(*right.shear)
+    assert abs(math.log(length)) < min(3 * float(found.deviations["shear"][0, 0]), 0.05)
+
+
+def test_a_specimen_that_is_not_there_is_told():
+    bead = Bead(1.2, 0.06, 1.4)
+    noise = 1 + 0.01 * torch.randn(1, 2, 32, 30, generator=torch.Generator().manual_seed(0))
+    part = part_of(noise, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
+    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
+    model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
+    with pytest.raises(ValueError, match="the specimen isn't in the images"):
+        find_optics(part, model, Acquisition([Prism((0.0, 0.2), 1.4)], (0.0, 1.0)), [0.01])
+
+
+# --- beside an unknown volume -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_unknown_specimen_tells_the_shears_direction():
+    place = Bead(1.2, 0.03, 1.4, (0.1, 0.3, -0.4))
+    true = Acquisition([Prism((0.06, 0.18), rad(b)) for b in (75, -75)], (-1.5, -0.5, 0.5, 1.5))
+    with torch.no_grad():
+        data = bead_images(true, 20000.0, 0, place, (32, 30))
+    told = Acquisition([Prism((0.0, 0.19), rad(b)) for b in (75, -75)], true.focus)
+    part = part_of(data, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
+    setup = part.setup(1.4, Microscope(0.546, Objective(0.8), Condenser(0.5)), told)
+    (found,) = find_angles(Beside(part, setup, Recipe(), [0.005, 0.005]).held())
+    error = found.value - math.atan2(0.06, 0.18)
+    assert abs(error) < rad(3)
+    assert abs(error) < 3 * max(found.deviation, rad(0.3))
