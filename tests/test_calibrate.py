@@ -9,6 +9,7 @@ import tomli_w
 import torch
 
 from data_synthetic import Bead
+from recon.calibration.trials.orders import Round
 from recon.cli import main
 from recon.config import load
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
@@ -24,7 +25,7 @@ TOLD = {
     "microscope": {"wavelength": 0.546, "objective": {"na": 0.8}, "condenser": {"na": 0.5}},
     "data": {"path": "stack.ome.tif", "offset": 100.0},
 }
-FEW = (("recon.calibration.trials.orders.ROUNDS", ((16, 4, 2, 6), (2, 5, 3, 6))),)
+FEW = (("recon.calibration.trials.orders.ROUNDS", (Round(16, 4, 2, 6), Round(2, 5, 3, 6))),)
 
 
 def prisms(length, degrees, bias):

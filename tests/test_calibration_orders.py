@@ -1,11 +1,13 @@
 """Signs and orders: what may have been recorded instead of what was declared, and which of it explains a stack."""
 
+import math
+
 import pytest
 import torch
 
 from recon.calibration.part import part_of
 from recon.calibration.trials.declared import all_mistakes, images_of, one_mistake
-from recon.calibration.trials.orders import find_orders
+from recon.calibration.trials.orders import LIKELY, Round, find_orders
 from recon.fit.problem import Problem, Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -107,9 +109,30 @@ WRONG = {
     "name", ["sign and focus", *(pytest.param(n, marks=pytest.mark.slow) for n in WRONG if n != "sign and focus")]
 )
 def test_the_race_finds_what_was_declared_wrongly(truth, name, monkeypatch):
-    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", ((8, 3, 2, 6), (2, 4, 3, 6)))
+    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(8, 3, 2, 6), Round(2, 4, 3, 6)))
     found = orders_of(truth, PAIR, WRONG[name])
     assert found.chosen.name == name
     assert images_of(found.chosen.acquisition) == images_of(PAIR)
     assert found.told
     assert name in found.table()
+
+
+def test_axes_that_are_nearly_across_one_another_have_no_twin():
+    """A quarter turn with the prisms exchanged is the declared acquisition within its uncertainty."""
+    angles, bias = (math.radians(29.7), math.radians(119.5)), 1.4
+    shears = [(0.2 * math.sin(angle), 0.2 * math.cos(angle)) for angle in angles]
+    declared = Acquisition([Prism(shear, b) for shear in shears for b in (bias, -bias)], [-1.0, 0.0, 1.0])
+    exact = [(0.1, 0.17320508), (0.17320508, -0.1)]
+    across = Acquisition([Prism(shear, b) for shear in exact for b in (bias, -bias)], [-1.0, 0.0, 1.0])
+    assert len(all_mistakes(declared)) == len(all_mistakes(across))
+
+
+def test_more_mistakes_are_tried_only_where_fewer_explain_nothing(truth, monkeypatch):
+    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(8, 3, 2, 6), Round(2, 4, 3, 6)))
+    several = [other for other in all_mistakes(PAIR) if other.mistakes > LIKELY]
+    assert several
+    tried = {tried.otherwise.name for tried in orders_of(truth, PAIR, WRONG["sign and focus"]).tried}
+    assert not tried & {other.name for other in several}
+    monkeypatch.setattr("recon.calibration.trials.orders.STANDS_OUT", 0.0)
+    tried = {tried.otherwise.name for tried in orders_of(truth, PAIR, WRONG["sign and focus"]).tried}
+    assert tried == {other.name for other in all_mistakes(WRONG["sign and focus"])}

@@ -1,11 +1,16 @@
 """What may have been recorded instead of what was declared: signs, orders and axes, one mistake or several at once."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
 
 from torchdic import Acquisition, Prism
 from torchdic.scalar import number
+
+# Descriptions whose shears differ by less than this part of their length, and biases by less than so much, give images
+# that no short fit tells apart: measured axes are never quite across one another.
+ALIKE, ALIKE_BIAS = 0.15, 0.1
 
 # All orders of the prisms are tried where there are at most so many of them; of more, none.
 MOST_PRISMS = 4
@@ -116,7 +121,7 @@ def one_mistake(declared: Acquisition) -> Iterator[Otherwise]:
 def all_mistakes(declared: Acquisition) -> list[Otherwise]:
     """The acquisition as declared, and with every combination of mistakes: axes, signs, order of prisms and of planes.
 
-    Those that give the same images are one, described by the fewest mistakes; the fewest come first.
+    Those that give nearly the same images are one, described by the fewest mistakes; the fewest come first.
     """
     turns = (_NONE, _SIGN, _AXES, *_MIRRORED, _AXES_AND_SIGN, *_QUARTERS)
     number_of = len(declared.prisms)
@@ -129,14 +134,28 @@ def all_mistakes(declared: Acquisition) -> list[Otherwise]:
         if back:
             steps.append(_reversed(steps[-1].acquisition if steps else declared))
         found.append(_together(declared, steps))
-    distinct: dict[object, Otherwise] = {}
+    distinct: list[Otherwise] = []
     # among equals a sign or an axis is the plainer mistake than exchanged prisms
     for other in sorted(found, key=lambda other: (other.mistakes, "prisms" in other.name)):
-        distinct.setdefault(images_of(other.acquisition), other)
-    return list(distinct.values())
+        if not any(_alike(other.acquisition, known.acquisition) for known in distinct):
+            distinct.append(other)
+    return distinct
 
 
-def images_of(acquisition: Acquisition) -> tuple[object, ...]:
+def _alike(one: Acquisition, other: Acquisition) -> bool:
+    """Whether two acquisitions give nearly the same images."""
+    (prisms, focus), (others, planes) = images_of(one), images_of(other)
+    if focus != planes or [len(a) for a in prisms] != [len(b) for b in others]:
+        return False
+    for (*shear, bias), (*shear_of_other, bias_of_other) in (
+        pair for pair in zip(prisms, others, strict=True) if pair[0]
+    ):
+        if math.dist(shear, shear_of_other) > ALIKE * math.hypot(*shear) or abs(bias - bias_of_other) > ALIKE_BIAS:
+            return False
+    return True
+
+
+def images_of(acquisition: Acquisition) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
     """What tells acquisitions apart. A prism of the other shear and bias is the same one, with its beams renamed."""
     prisms = []
     for prism in acquisition.prisms:

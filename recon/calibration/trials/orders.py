@@ -10,6 +10,7 @@ have one weight, that at which the best volume so far leaves the noise, and what
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
 from recon.calibration.trials.short_fits import coarse_steps
@@ -17,8 +18,21 @@ from recon.fit.problem import Problem, Recipe
 from recon.fit.step import Step
 from torchdic import Acquisition
 
-# Of each round: how many descriptions are tried at most, the slices of their volumes, steps and condenser directions.
-ROUNDS = ((10_000, 10, 2, 8), (4, 12, 6, 12), (2, 20, 8, 18))
+
+class Round(NamedTuple):
+    """How many descriptions a round tries at most, the slices of their volumes, steps and condenser directions."""
+
+    most: int
+    slices: int
+    steps: int
+    sources: int
+
+
+ROUNDS = (Round(10_000, 10, 2, 8), Round(4, 12, 6, 12), Round(2, 20, 8, 18))
+
+# Descriptions of more mistakes than LIKELY are tried only where none of fewer stands out: where the best one leaves
+# more than this share of what half of them leave.
+LIKELY, STANDS_OUT = 2, 0.5
 
 # A description is preferred to the declared one only where it lowers what that leaves by this share, the noise left
 # out: a wrong sign, order or axis leaves far more.
@@ -75,23 +89,53 @@ def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, no
     declared: the whole stack's acquisition. problem_of: see `ProblemOf`. recipe: with bounds and a prior.
     noise: standard deviation of each prism's; None where it isn't known.
     """
-    racing: Sequence[Otherwise] = all_mistakes(declared)
-    found: dict[object, Tried] = {}
-    alone = 0.0
-    for number, (most, slices, steps, sources) in enumerate(ROUNDS, 1):
-        if number > 1:
-            best = sorted(racing, key=lambda other: found[_key(other)].loss)[:most]
-            # the declared one stays in the race: it is what the others are compared with
-            racing = best if any(o.mistakes == 0 for o in best) else [*best, *(o for o in racing if o.mistakes == 0)]
-            recipe = _held(recipe, _last(problem_of(racing[0].acquisition, slices, recipe), steps, sources))
+    every = all_mistakes(declared)
+    likely = [other for other in every if other.mistakes <= LIKELY]
+    race = _Race(problem_of, noise)
+    race.run(likely, 1, recipe)
+    if not race.one_stands_out:
+        race.run([other for other in every if other.mistakes > LIKELY], 1, recipe)
+    for number in range(2, len(ROUNDS) + 1):
+        racing = race.best(ROUNDS[number - 1].most)
+        recipe = _held(recipe, race.fitted(racing[0], number, recipe))
+        race.run(racing, number, recipe)
+    ranked = sorted(race.tried.values(), key=lambda tried: (-tried.rounds, tried.loss))
+    return _chosen(tuple(ranked), race.alone)
+
+
+class _Race:
+    """Short fits of descriptions, round by round. tried: their last ones. alone: what noise leaves of the misfit."""
+
+    def __init__(self, problem_of: ProblemOf, noise: Sequence[float] | None) -> None:
+        self._problem_of, self._noise = problem_of, noise
+        self.tried: dict[object, Tried] = {}
+        self.alone = 0.0
+
+    def run(self, racing: Sequence[Otherwise], number: int, recipe: Recipe) -> None:
+        """Fit each description as a round asks for."""
         for other in racing:
-            problem = problem_of(other.acquisition, slices, recipe)
-            alone = problem.misfit.of_noise(noise) or 0.0
-            last = _last(problem, steps, sources)
+            last = self.fitted(other, number, recipe)
             misfit, loss = (math.inf, math.inf) if last is None else (last.misfit, last.loss)
-            found[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)
-    ranked = sorted(found.values(), key=lambda tried: (-tried.rounds, tried.loss))
-    return _chosen(tuple(ranked), alone)
+            self.tried[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)
+
+    def fitted(self, other: Otherwise, number: int, recipe: Recipe) -> Step | None:
+        """The last step of a description's short fit; None where its light can't be followed."""
+        this = ROUNDS[number - 1]
+        problem = self._problem_of(other.acquisition, this.slices, recipe)
+        self.alone = problem.misfit.of_noise(self._noise) or 0.0
+        return _last(problem, this.steps, this.sources)
+
+    def best(self, most: int) -> list[Otherwise]:
+        """The best so many of the last round, and the declared one, with which the others are compared."""
+        last = max(tried.rounds for tried in self.tried.values())
+        ranked = sorted((t for t in self.tried.values() if t.rounds == last), key=lambda tried: tried.loss)
+        return [t.otherwise for place, t in enumerate(ranked) if place < most or t.otherwise.mistakes == 0]
+
+    @property
+    def one_stands_out(self) -> bool:
+        """Whether the best description leaves far less than half of them do."""
+        left = sorted(tried.misfit for tried in self.tried.values())
+        return left[0] < STANDS_OUT * left[len(left) // 2]
 
 
 def _last(problem: Problem, steps: int, sources: int) -> Step | None:
