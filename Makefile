@@ -16,6 +16,8 @@ demo: $(INSTALLED)
 
 # tests run side by side, each on one thread: a test's tensors are too small for more
 test test-all: export OMP_NUM_THREADS := 1
+# what one process compiles is kept for the others
+test test-all: export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
 test: $(INSTALLED)

@@ -48,7 +48,7 @@ from recon.report.verdict import Verdict, judged
 from recon.run.reconstruct import RECOMMENDED, RECOMMENDED_FOR_ADAM
 from recon.run.results import model_images
 from scenes import Scene
-from torchdic import Acquisition, Camera, Condenser, Fidelity, Prism
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
 
@@ -81,10 +81,14 @@ class Found:
         return float(self.delta.sum() / self.scene.truth.sum())
 
 
-def setup_of(scene: Scene) -> Setup:
-    """The empty volume before the scene's microscope, wider than the field where the specimen is."""
+def setup_of(scene: Scene, margin: int | None = None) -> Setup:
+    """The empty volume before the scene's microscope.
+
+    margin: voxels beyond the field; None is as many as the images ask for.
+    """
     grid, data = scene.grid, scene.data
-    margin = needed_margin(data.numpy(), measured_noise(data), grid, scene.microscope, scene.background)
+    if margin is None:
+        margin = needed_margin(data.numpy(), measured_noise(data), grid, scene.microscope, scene.background)
     medium = empty_medium(grid.widened(margin, margin), scene.background, data)
     return Setup(medium, scene.microscope, scene.acquisition, margin=margin)
 
@@ -294,6 +298,10 @@ def mistakes(options: argparse.Namespace) -> None:
         "one image of another plane": replace(
             scene, data=scene.data.index_copy(1, torch.tensor([6]), scene.data[:, 1:2])
         ),
+        "one prism's shear reversed": replace(
+            scene, acquisition=Acquisition([_reversed(declared.prisms[0]), *declared.prisms[1:]], declared.focus)
+        ),
+        "cut by the edge, no margin": cut_scene(scene, 28),
     }
     print(
         "| mistake | error | misfit/noise | whiteness | warned | first | second | s of the search |\n"
@@ -301,16 +309,32 @@ def mistakes(options: argparse.Namespace) -> None:
         + "|"
     )
     for name in options.names or made:
-        found, verdict, seconds = judged_fit(made[name])
+        found, verdict, seconds = judged_fit(made[name], margin=0 if "margin" in name else None)
         causes = [f"{cause.name} ({cause.share:.0%})" for cause in verdict.causes[:2]] + ["–", "–"]
         numbers = (f"{found.error:.2f}", f"{verdict.ratio or math.nan:.3f}", f"{verdict.white:.2f}")
         cells = (name, *numbers, "yes" if verdict.poor else "no", *causes[:2], f"{seconds:.0f}")
         print("| " + " | ".join(cells) + " |", flush=True)
 
 
-def judged_fit(scene: Scene) -> tuple[Found, Verdict, float]:
-    """A scene's fit, the verdict on it, and the processor seconds that the verdict took."""
-    setup, noise = setup_of(scene), measured_noise(scene.data)
+def _reversed(prism: Prism | None) -> Prism:
+    """A prism whose shear points the other way."""
+    assert prism is not None
+    return replace(prism, shear=tuple(-float(part) for part in prism.shear))
+
+
+def cut_scene(scene: Scene, columns: int) -> Scene:
+    """The part of a scene's field from a column on, whose edge cuts the specimen."""
+    nz, ny, nx = scene.grid.shape
+    grid = Grid((nz, ny, nx - columns), scene.grid.spacing)
+    return replace(scene, data=scene.data[..., columns:], truth=scene.truth[..., columns:], grid=grid)
+
+
+def judged_fit(scene: Scene, margin: int | None = None) -> tuple[Found, Verdict, float]:
+    """A scene's fit, the verdict on it, and the processor seconds that the verdict took.
+
+    margin: voxels beyond the field; None is as many as the images ask for.
+    """
+    setup, noise = setup_of(scene, margin), measured_noise(scene.data)
     found, recipe = fit(scene, setup=setup), replace(Recipe(), bounds=Bounds(*scene.bounds))
     problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, noise=noise)
     began, rows = time.process_time(), [(n + 1, found.last.misfit, 0.0, 0.0) for n in range(found.last.number)]

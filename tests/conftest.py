@@ -1,6 +1,6 @@
 """Annotations are enforced here, and only here: each call checks the shapes and types it was promised.
 
-`make test` checks the first 100 calls of each function in each test, `make test-all` every one.
+`make test` checks the first 10 calls of each function in each test, `make test-all` every one.
 """
 
 import functools
@@ -30,9 +30,10 @@ most_calls = math.inf
 def checked_at_first(*, typechecker: Any) -> Callable:
     """jaxtyping's decorator, but it does not check what repeats itself.
 
-    A function that another one defines is checked the first 20 times that it is defined: the import hook decorates each
+    A function that another one defines is checked the first 5 times that it is defined: the import hook decorates each
     definition, to build the check takes milliseconds, and a solver defines functions at every step. Any other function
-    is checked at its first `most_calls` calls in each test.
+    is checked at its first `most_calls` calls in each test. A function's check is built when it is first called: a
+    process imports all functions and calls some.
     """
     check = jaxtyped(typechecker=typechecker)
 
@@ -42,13 +43,18 @@ def checked_at_first(*, typechecker: Any) -> Callable:
         code = function.__code__
         if "<locals>" in function.__qualname__:
             made[code] += 1
-            return check(function) if made[code] <= 20 else function
-        checked = check(function)
+            return check(function) if made[code] <= 5 else function
+        checked = None
 
         @functools.wraps(function)
         def call(*arguments: Any, **named: Any) -> Any:
+            nonlocal checked
             called[code] += 1
-            return (checked if called[code] <= most_calls else function)(*arguments, **named)
+            if called[code] > most_calls:
+                return function(*arguments, **named)
+            if checked is None:
+                checked = check(function)
+            return checked(*arguments, **named)
 
         return call
 
@@ -161,7 +167,7 @@ def measured_file():
 
 def pytest_configure(config):
     global most_calls
-    most_calls = 100 if config.option.markexpr == "not slow" else math.inf
+    most_calls = 10 if config.option.markexpr == "not slow" else math.inf
 
 
 def pytest_addoption(parser):

@@ -5,7 +5,9 @@ RESULTS = {
     "metrics.json",
     "log.csv",
     "config.resolved.toml",
+    "images.ome.tif",
     "images.png",
     "sections.png",
     "misfit.png",
+    "checkpoint.pt",
 }

@@ -5,6 +5,7 @@ import inspect
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -81,10 +82,12 @@ def name_of(path):
 ALL = [path for package in PACKAGES for path in modules(package)]
 
 
+@cache
 def parsed(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@cache
 def imported(path):
     """The full names of the modules that a file imports, wherever in it."""
     names = set()
@@ -96,7 +99,7 @@ def imported(path):
             assert node.module is not None
             # "from package import module" names a module too
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return frozenset(names)
 
 
 def packages(path):
@@ -109,8 +112,17 @@ def room(path):
 
 
 def rooms_imported(path, package):
-    known = {room(p) for p in modules(package)}
-    return {name.split(".")[1] for name in imported(path) if name.startswith(f"{package}.")} & known
+    return {name.split(".")[1] for name in imported(path) if name.startswith(f"{package}.")} & rooms(package)
+
+
+@cache
+def rooms(package):
+    return {room(path) for path in modules(package)}
+
+
+def offenders(paths, what):
+    """The files of which `what` holds anything, by name, and what it holds."""
+    return {name_of(path): found for path in paths if (found := what(path))}
 
 
 # --- the order of imports --------------------------------------------------------------------------------------------
@@ -118,21 +130,20 @@ def rooms_imported(path, package):
 
 @pytest.mark.parametrize(("package", "order"), [("torchdic", ROOMS), ("recon", RECON)])
 def test_every_room_has_its_place(package, order):
-    assert {room(path) for path in modules(package)} - {"__init__"} == set(order)
+    assert rooms(package) - {"__init__"} == set(order)
 
 
-@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
-def test_imports_point_down(path):
-    if room(path) == "__init__":
-        return
-    assert rooms_imported(path, "torchdic") <= set(ROOMS[: ROOMS.index(room(path)) + 1])
-    assert "torchdic" not in imported(path), "a file names the room that it uses"
+@pytest.mark.parametrize(("package", "order"), [("torchdic", ROOMS), ("recon", RECON)])
+def test_imports_point_down(package, order):
+    def upward(path):
+        return rooms_imported(path, package) - set(order[: order.index(room(path)) + 1])
+
+    assert offenders((path for path in modules(package) if room(path) != "__init__"), upward) == {}
 
 
-@pytest.mark.parametrize("path", modules("recon"), ids=name_of)
-def test_imports_of_the_inverse_point_down(path):
-    if room(path) != "__init__":
-        assert rooms_imported(path, "recon") <= set(RECON[: RECON.index(room(path)) + 1])
+def test_a_file_names_the_room_that_it_uses():
+    inside = [path for path in modules("torchdic") if room(path) != "__init__"]
+    assert offenders(inside, lambda path: {"torchdic"} & imported(path)) == {}
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -149,29 +160,28 @@ def test_files_do_not_import_in_circles(package):
     assert placed == set(uses)
 
 
-@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
-def test_torchdic_knows_neither_its_inverse_nor_its_specimens(path):
-    assert not packages(path) & {"recon", "data_synthetic"}
+def test_torchdic_knows_neither_its_inverse_nor_its_specimens():
+    assert offenders(modules("torchdic"), lambda path: packages(path) & {"recon", "data_synthetic"}) == {}
 
 
-@pytest.mark.parametrize("path", modules("recon"), ids=name_of)
-def test_inverse_cannot_see_the_truth(path):
-    if room(path) != "cli":
-        assert "data_synthetic" not in packages(path)
+def test_inverse_cannot_see_the_truth():
+    blind = [path for path in modules("recon") if room(path) != "cli"]
+    assert offenders(blind, lambda path: packages(path) & {"data_synthetic"}) == {}
 
 
-@pytest.mark.parametrize("path", modules("data_synthetic"), ids=name_of)
-def test_specimens_know_the_grid_and_no_more_of_torchdic(path):
+def test_specimens_know_the_grid_and_no_more_of_torchdic():
     """Their exact answers must not come from the models that they judge; a recorder's images must come from one."""
-    assert "recon" not in packages(path)
-    if room(path) != "recorder":
-        assert rooms_imported(path, "torchdic") <= {"grid"}
-        assert not any(name.startswith("data_synthetic.recorder") for name in imported(path))
+    specimens = modules("data_synthetic")
+    assert offenders(specimens, lambda path: packages(path) & {"recon"}) == {}
+    exact = [path for path in specimens if room(path) != "recorder"]
+    assert offenders(exact, lambda path: rooms_imported(path, "torchdic") - {"grid"}) == {}
+    of_recorder = "data_synthetic.recorder"
+    assert offenders(exact, lambda path: [n for n in imported(path) if n.startswith(of_recorder)]) == {}
 
 
-@pytest.mark.parametrize("path", modules("torchdic/memory"), ids=name_of)
-def test_memory_knows_no_optics(path):
-    assert rooms_imported(path, "torchdic") <= {"errors", "grid", "memory"}
+def test_memory_knows_no_optics():
+    inside = modules("torchdic/memory")
+    assert offenders(inside, lambda path: rooms_imported(path, "torchdic") - {"errors", "grid", "memory"}) == {}
 
 
 def test_solver_and_viewer_stay_in_one_place():
@@ -256,11 +266,10 @@ def without_docstrings(tree):
     ]
 
 
-@pytest.mark.parametrize("path", modules("torchdic"), ids=name_of)
-def test_a_propagations_name_stands_in_its_places_alone(path):
+def test_a_propagations_name_stands_in_its_places_alone():
     names = {propagation.name for propagation in propagations()}
-    if not name_of(path).startswith(NAMED_IN):
-        assert not names & set(without_docstrings(parsed(path)))
+    elsewhere = [path for path in modules("torchdic") if not name_of(path).startswith(NAMED_IN)]
+    assert offenders(elsewhere, lambda path: names & set(without_docstrings(parsed(path)))) == {}
 
 
 def test_rooms_hand_nothing_on():

@@ -369,7 +369,7 @@ def test_version_is_the_projects(capsys):
 
 def test_a_folder_in_a_folder_that_is_not_there_yet_is_made(write, run, tmp_path):
     assert run("simulate", write(), out=tmp_path / "a" / "b")[0] == 0
-    assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["stack.ome.tif", "stack.png"]
+    assert "stack.ome.tif" in {p.name for p in (tmp_path / "a" / "b").iterdir()}
 
 
 def test_the_installed_command_answers_with_one_line_and_exit_code_2(write, tmp_path):
@@ -455,7 +455,7 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
 
 
 @pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")
-@pytest.mark.parametrize("more", [{}, {"fidelity": ..., "tolerance": 0.3}])
+@pytest.mark.parametrize("more", [{}, pytest.param({"fidelity": ..., "tolerance": 0.3}, marks=pytest.mark.slow)])
 def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, more):
     """With oil behind 3 µm of water, the condenser's too, and with a planned fidelity."""
     layer = {"thickness": 3.0, "index": 1.335, "design_index": 1.515}

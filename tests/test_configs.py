@@ -14,7 +14,7 @@ FILES = sorted(EXPERIMENTS.glob("*.toml"))
 
 
 def test_the_promised_experiments_are_there():
-    promised = {"bead.toml", "etched_glass.toml", "cell.toml", "measured.toml", "four_frames.toml", "six_frames.toml"}
+    promised = {"bead.toml", "etched_glass.toml", "cell.toml", "four_frames.toml", "six_frames.toml"}
     assert promised <= {path.name for path in FILES}
 
 

@@ -1,6 +1,7 @@
 """What a scene does not have costs nothing: transforms, ray equations and bytes, counted with and without it."""
 
 import math
+from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
 
@@ -189,11 +190,12 @@ def test_field_of_a_source_serves_every_prism_and_focus(delta, counted, propagat
 
     def room(acquisition):
         """A budget for 2 sources at once: batches of 2, 2 and 1."""
-        budgets = (int(1.05**i) for i in range(200, 500))
-        volume = Volume(GRID, delta, N0)
-        return next(
-            m for m in budgets if foreseen(volume, scope, acquisition, Fidelity(propagation, memory=m)).sources == 2
-        )
+        volume, budgets = Volume(GRID, delta, N0), [int(1.05**i) for i in range(200, 500)]
+
+        def sources(budget):
+            return foreseen(volume, scope, acquisition, Fidelity(propagation, memory=budget)).sources
+
+        return budgets[bisect_left(budgets, 2, key=sources)]
 
     with torch.no_grad():
         alone, several = (

@@ -38,7 +38,7 @@ def recipe(request):
     return METHODS[request.param]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def truth():
     """A ball off the centre along every axis."""
     return GaussianBall(0.5, 0.02, BACKGROUND, (0.3, -0.5, 0.4)).delta(GRID, dtype=torch.float32)
@@ -51,6 +51,20 @@ def seen(truth, acquisition=TWO_SHEARS, fidelity=FIDELITY):
 
 def run(data, recipe, acquisition=TWO_SHEARS, fidelity=FIDELITY, resume=None):
     return list(descend(data, GRID, BACKGROUND, MICROSCOPE, acquisition, fidelity, recipe, resume))
+
+
+@pytest.fixture(scope="module")
+def descended(truth):
+    """A function from a recipe to the steps of its run, made once."""
+    done = {}
+
+    def steps(recipe):
+        name = next(name for name, one in METHODS.items() if one == recipe)
+        if name not in done:
+            done[name] = run(seen(truth), recipe)
+        return done[name]
+
+    return steps
 
 
 # the descent
@@ -76,6 +90,7 @@ def test_newtons_misfit_falls_fiftyfold_in_few_steps(truth):
         assert volume_error(steps[-1].delta.flip(axis), truth) > volume_error(steps[-1].delta, truth) + 0.2
 
 
+@pytest.mark.slow  # test_newton holds it to the same
 def test_newton_leaves_what_the_noise_leaves(truth):
     """The misfit of noise that it measured itself, neither far more nor less."""
     data = seen(truth)
@@ -135,8 +150,8 @@ def test_any_acquisition_descends(truth, acquisition, recipe):
 
 
 @NEWTON_SLOW
-def test_steps_are_numbered_from_1_and_time_goes_on(truth, recipe):
-    steps = run(seen(truth), recipe)
+def test_steps_are_numbered_from_1_and_time_goes_on(descended, recipe):
+    steps = descended(recipe)
     assert [step.number for step in steps] == list(range(1, 13))
     assert all(0 < a.seconds < b.seconds for a, b in itertools.pairwise(steps))
 
@@ -162,8 +177,8 @@ def test_what_a_step_holds_does_not_change_any_more(truth, bounds, recipe):
     assert not steps[-1].state["delta"]["parameter"].requires_grad
 
 
-def test_a_step_s_delta_is_its_parameters(truth):
-    step = run(seen(truth), ADAM)[-1]
+def test_a_step_s_delta_is_its_parameters(descended):
+    step = descended(ADAM)[-1]
     assert torch.equal(step.delta, ADAM.bounds.delta(step.state["delta"]["parameter"]))
     assert torch.equal(step.delta, step.values["delta"])
 
@@ -175,16 +190,15 @@ def test_delta_stays_within_its_bounds(truth, recipe):
         assert float(step.delta.max()) <= 0.01 + 1e-8
 
 
-@pytest.mark.parametrize(
-    ("bounds", "error"), [pytest.param(Bounds(None, None), 0.75, marks=pytest.mark.slow), (Bounds(None, 0.0), 0.55)]
-)
+@pytest.mark.parametrize(("bounds", "error"), [(Bounds(None, None), 0.75), (Bounds(None, 0.0), 0.55)])
 @pytest.mark.parametrize(
     "given",
     [
-        pytest.param({}, marks=pytest.mark.slow),  # test_newton holds it to the same
+        {},  # which test_newton holds to the same in make test
         {"method": "adam", "steps": 40, "learning_rate": 2e-3, "tv": (10.0, 10.0)},
     ],
 )
+@pytest.mark.slow
 def test_a_negative_contrast_is_found_where_the_bounds_let_it(truth, bounds, error, given):
     recipe = Recipe(**given, bounds=bounds)
     assert volume_error(run(seen(-truth), recipe)[-1].delta, -truth) < error
@@ -219,10 +233,10 @@ def test_l1_pulls_an_invisible_uniform_index_down(truth, recipe):
     assert float(held) < 0.9 * float(free)
 
 
-def test_draft_sources_serve_the_first_60_percent_only(truth):
+def test_draft_sources_serve_the_first_60_percent_only(truth, descended):
     data = seen(truth)
     recipe = dataclasses.replace(ADAM, draft_sources=3)
-    drafted, few, all_ = run(data, recipe), run(data, recipe, fidelity=Fidelity(sources=3)), run(data, ADAM)
+    drafted, few, all_ = run(data, recipe), run(data, recipe, fidelity=Fidelity(sources=3)), descended(ADAM)
     # 12 steps: numbers 1 to 8 (0 … 7 < 7.2) are drafts
     assert all(alike(a, b) for a, b in zip(drafted[:8], few[:8], strict=True))
     assert drafted[8].misfit != few[8].misfit
@@ -294,7 +308,9 @@ def test_a_volume_whose_index_is_below_0_is_no_start(truth, recipe):
         run(seen(truth), recipe)
 
 
-@pytest.mark.parametrize("bounds", [Bounds(None, None), Bounds(-3.0, 3.0)], ids=["none", "wide"])
+@pytest.mark.parametrize(
+    "bounds", [Bounds(None, None), pytest.param(Bounds(-3.0, 3.0), marks=pytest.mark.slow)], ids=["none", "wide"]
+)
 def test_newton_takes_no_step_that_has_no_images(truth, bounds):
     """Data far brighter than any specimen makes: every long step is taken back, and the misfit never rises for it."""
     data = seen(truth)
@@ -365,31 +381,30 @@ def test_a_step_of_another_method_is_refused(truth, one, other):
 
 
 @NEWTON_SLOW
-def test_two_runs_are_bit_for_bit_the_same(truth, recipe):
-    one, other = run(seen(truth), recipe), run(seen(truth), recipe)
+def test_two_runs_are_bit_for_bit_the_same(truth, descended, recipe):
+    one, other = descended(recipe), run(seen(truth), recipe)
     assert all(alike(a, b) for a, b in zip(one, other, strict=True))
 
 
 @NEWTON_SLOW
-def test_resuming_counts_the_seconds_on(truth, recipe):
-    steps = run(seen(truth), recipe)
+def test_resuming_counts_the_seconds_on(truth, descended, recipe):
+    steps = descended(recipe)
     late = dataclasses.replace(steps[5], seconds=1000.0)
     assert run(seen(truth), recipe, resume=late)[0].seconds > 1000
 
 
 @NEWTON_SLOW
-def test_resuming_leaves_the_step_that_it_went_on_from_alone(truth, recipe):
-    steps = run(seen(truth), recipe)
+def test_resuming_leaves_the_step_that_it_went_on_from_alone(truth, descended, recipe):
+    steps = descended(recipe)
     before = copy.deepcopy(steps[4])
     run(seen(truth), recipe, resume=steps[4])
     assert alike(steps[4], before)
 
 
 @pytest.fixture
-def saved(truth, tmp_path, recipe):
+def saved(truth, tmp_path, descended, recipe):
     """A checkpoint of step 5 on disk: (path, data, all steps)."""
-    data = seen(truth)
-    steps = run(data, recipe)
+    data, steps = seen(truth), descended(recipe)
     rows = [(s.number, s.misfit, s.loss, s.seconds) for s in steps[:5]]
     path = tmp_path / "checkpoint.pt"
     checkpoint.save(path, Checkpoint(steps[4], rows, "volume.shape = [6, 16, 14]\ndata's sha256 = abc"))

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -88,6 +89,7 @@ FIDELITIES = {
 }
 # each of these has a like among the others
 DEAR = (
+    "rays, adaptive",
     "rays, cubic, padded",
     "rays, recomputed",
     "wave, first order, recomputed",
@@ -126,7 +128,7 @@ OF_RAYS = ("plain", "lenses of matrices")
 @pytest.mark.parametrize(
     ("propagation", "name"),
     [
-        pytest.param(propagation, name, marks=pytest.mark.slow if propagation == "rays" and name not in OF_RAYS else ())
+        pytest.param(propagation, name, marks=pytest.mark.slow if propagation != "wave" and name not in OF_RAYS else ())
         for propagation in ("projection", "rays", "wave")
         for name in SCOPES
     ],
@@ -171,6 +173,7 @@ def test_plan_is_made_there(values):
     assert made.error <= 0.05
 
 
+@cache
 def waits(propagation, slices=6, sources=6, planes=2, prisms=2):
     """How often the CPU waits for the device while an image and its gradient are made."""
     grid = Grid((slices, 11, 14), (0.4, 0.2, 0.21))

@@ -29,7 +29,7 @@ CONFIG = {
     "fidelity": {"sources": 6, "order": 1},
     "data": {"path": "stack.ome.tif"},
 }
-RESULTS = {"volume.ome.tif", "metrics.json", "config.resolved.toml", "images.png", "sections.png"}
+RESULTS = {"volume.ome.tif", "metrics.json", "config.resolved.toml", "images.ome.tif", "images.png", "sections.png"}
 METHODS = pytest.mark.parametrize("method", ["linear", "opl"])
 OPL_SLOW = pytest.mark.parametrize("method", ["linear", pytest.param("opl", marks=pytest.mark.slow)])
 
@@ -67,7 +67,8 @@ def test_a_direct_method_leaves_its_volume_and_its_numbers(write, truth, tmp_pat
     out = tmp_path / "out"
     assert main(["reconstruct", str(write(method)), "--out", str(out)]) == 0
     assert f"{out / 'volume.ome.tif'}: Δn" in capsys.readouterr().out
-    assert {p.name for p in out.iterdir()} == RESULTS | ({"opl.ome.tif"} if method == "opl" else set())
+    expected = RESULTS | ({"opl.ome.tif"} if method == "opl" else set())
+    assert {p.name for p in out.iterdir()} == expected
     delta, metrics = found(out)
     assert delta.shape == GRID.shape
     # the sum along z: a section of path length doesn't say where along z it lies
@@ -107,15 +108,18 @@ def test_path_lengths_are_left_in_µm_with_the_pixel_and_the_focus_step(write, t
 
 @OPL_SLOW
 @pytest.mark.usefixtures("no_pictures")
-def test_a_second_run_begins_anew(write, tmp_path, method):
+def test_a_second_run_begins_anew_where_asked(write, tmp_path, method, capsys):
     path, out = write(method), tmp_path / "out"
-    for options in ([], ["--resume"], ["--restart"]):
-        assert main(["reconstruct", str(path), "--out", str(out), *options]) == 0
-        delta, metrics = found(out)
-        assert metrics["steps"] == 1
-        first = delta if not options else first
-        assert torch.equal(delta, first)
-        assert not (out / "checkpoint.pt").exists()
+    assert main(["reconstruct", str(path), "--out", str(out)]) == 0
+    first, _ = found(out)
+    for options in ([], ["--resume"]):
+        assert main(["reconstruct", str(path), "--out", str(out), *options]) == 2
+        assert "metrics.json: the folder has results" in capsys.readouterr().err
+    assert main(["reconstruct", str(path), "--out", str(out), "--restart"]) == 0
+    delta, metrics = found(out)
+    assert metrics["steps"] == 1
+    assert torch.equal(delta, first)
+    assert not (out / "checkpoint.pt").exists()
 
 
 @OPL_SLOW

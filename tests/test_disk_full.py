@@ -3,6 +3,7 @@
 import errno
 import resource
 import warnings
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -56,13 +57,15 @@ def full(monkeypatch):
     return fill
 
 
-@pytest.fixture
+@contextmanager
 def limited():
-    """No file may grow beyond 8 KiB, as where a disk is full."""
+    """No file may grow beyond 8 KiB, as where a disk is full; nor may pytest's own output, so no longer than needed."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture
@@ -88,10 +91,12 @@ def test_a_checkpoint_without_room_is_told_and_the_run_goes_on(run, full):
     code, told, left = run("reconstruct")
     assert code == 0
     assert len([line for line in told if "checkpoint.pt: cannot be written: No space left on device" in line]) == 1
-    assert left == RESULTS
+    assert left == RESULTS - {"checkpoint.pt"}
 
 
-@pytest.mark.parametrize("name", sorted(RESULTS - {"log.csv", "images.png", "sections.png", "misfit.png"}))
+@pytest.mark.parametrize(
+    "name", sorted(RESULTS - {"log.csv", "images.png", "sections.png", "misfit.png", "checkpoint.pt"})
+)
 def test_a_result_without_room_is_named_and_the_others_are_kept(run, full, name):
     full(name)
     code, told, left = run("reconstruct")
@@ -128,7 +133,7 @@ def test_a_volume_without_room_is_written_compressed(run, full, monkeypatch, tmp
     imwrite = tifffile.imwrite
 
     def needs_room(path, data, **options):
-        if options.get("compression") is None and path.parent.name == "out":
+        if options.get("compression") is None and data.size == 4 * 14 * 12:  # the volume
             raise OSError(f"{data.size} requested and 0 written")  # as numpy says it
         imwrite(path, data, **options)
 
@@ -140,7 +145,6 @@ def test_a_volume_without_room_is_written_compressed(run, full, monkeypatch, tmp
     assert read_volume(tmp_path / "out" / "volume.ome.tif")[0].shape == (4, 14, 12)
 
 
-@pytest.mark.usefixtures("limited")
 def test_every_writer_names_its_file_and_the_reason(tmp_path):
     step = Step(1, 0.5, 0.6, torch.rand(4, 40, 40), 0.1, {}, {})
     figure = Figure()
@@ -152,7 +156,7 @@ def test_every_writer_names_its_file_and_the_reason(tmp_path):
         "volume.ome.tif": lambda path: write_volume(path, torch.rand(4, 40, 40), Grid((4, 40, 40), (1, 1, 1))),
     }
     for name, write in writers.items():
-        with pytest.raises((WriteError, StackError), match="cannot be written: ") as caught:
+        with limited(), pytest.raises((WriteError, StackError), match="cannot be written: ") as caught:
             write(tmp_path / name)
         assert str(caught.value).startswith(f"{tmp_path / name}: ")
         assert "\n" not in str(caught.value)

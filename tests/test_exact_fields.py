@@ -71,12 +71,13 @@ def test_rays_err_by_thousandths_on_the_strong_smooth_ball_too(table, exact):
     assert float(found.max()) < 0.0105, found
 
 
+@pytest.mark.slow  # what the smooth ball asks of straight rays stands in test_ablation and test_reference
 @pytest.mark.parametrize(
     ("case", "na", "floor"),
     [
-        pytest.param("smooth ball", 0.8, 0.10, marks=pytest.mark.slow),
+        ("smooth ball", 0.8, 0.10),
         ("sharp bead", 0.8, 0.15),
-        pytest.param("strong bead", 0.8, 0.3, marks=pytest.mark.slow),
+        ("strong bead", 0.8, 0.3),
     ],
 )
 def test_straight_rays_are_not_enough(table, exact, case, na, floor):

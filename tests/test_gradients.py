@@ -25,7 +25,7 @@ PARAMETERS = ("delta", "absorption", "background", "shear", "bias", "focus", "ab
 # what crosses the specimen; the further parameters act on the field, whatever brought it
 CROSSING = ("delta", "absorption", "background")
 # test_laws compares the recomputed with the kept one, and the rays of test_ray_solver are cubic
-DEAR = ("rays-cubic-recomputed",)
+DEAR = ("projection-cubic-recomputed", "rays-cubic-recomputed")
 PROPAGATIONS = ("projection", "rays", "wave")
 
 

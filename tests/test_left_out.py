@@ -62,9 +62,10 @@ def run(tmp_path):
         for file, array in (files or {}).items():
             tifffile.imwrite(tmp_path / file, array, photometric="minisblack")
         values = CONFIG | {"data": {"path": "stack.ome.tif", "offset": 100.0} | (section or {})}
-        values["reconstruction"] = {"steps": 7} | reconstruction
+        values["reconstruction"] = {"steps": 5} | reconstruction
         (tmp_path / "config.toml").write_text(tomli_w.dumps(values), encoding="utf-8")
         out, err, folder = io.StringIO(), io.StringIO(), tmp_path / name
+        options = options or ("--restart",)
         with redirect_stdout(out), redirect_stderr(err):
             code = main(["reconstruct", str(tmp_path / "config.toml"), "--out", str(folder), *options])
         if code:
@@ -81,7 +82,7 @@ def _fast(no_pictures):
 
 
 METHODS = [{"method": "newton"}, {"method": "adam"}, {"method": "linear"}, {"method": "opl"}]
-MISFITS = [{"misfit": "poisson"}, {"misfit": "robust"}]
+MISFITS = [pytest.param({"misfit": "poisson"}, marks=pytest.mark.slow, id="poisson"), {"misfit": "robust"}]
 
 
 @pytest.mark.parametrize("how", METHODS + MISFITS, ids=lambda how: next(iter(how.values())))
@@ -123,7 +124,7 @@ def test_a_clean_stack_leaves_nothing_out(run, counts):
     assert torch.equal(masked, found)
 
 
-@pytest.mark.parametrize("shape", [(32, 30), (3, 32, 30), (2, 3, 32, 30)])
+@pytest.mark.parametrize("shape", [(32, 30), pytest.param((3, 32, 30), marks=pytest.mark.slow), (2, 3, 32, 30)])
 def test_what_the_users_mask_leaves_out_changes_nothing(run, counts, shape):
     mask = np.full(shape, 7, np.uint8)
     mask[..., 3:9, 20:28] = 0

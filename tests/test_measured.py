@@ -201,6 +201,21 @@ def test_flattening_takes_out_the_tilt_and_leaves_the_specimen():
     assert np.abs(flat - truth).max() < 0.1 * np.abs(tilt - truth).max()
 
 
+@pytest.mark.parametrize(("steep", "within"), [(1.0, 0.01), (1.4, 0.03)])
+@pytest.mark.parametrize("centre", [0.0, 0.3])
+def test_a_vignette_of_cos4_is_followed_and_stays_above_zero(steep, within, centre):
+    """It falls to 0.18 and 0.08 at a corner, where a polynomial of the same order falls below 0."""
+    y, x = np.meshgrid(np.linspace(-1, 1, 96), np.linspace(-1, 1, 96), indexing="ij")
+    lit = 1000 * (1 + (y**2 + (x - centre) ** 2) * steep**2 / 2) ** -2.0
+    seen = lit.copy()
+    seen[30:55, 40:70] *= 1 + 0.4 * np.sign(np.arange(30) - 15)  # a specimen
+    found = background_surface(np.random.default_rng(0).poisson(seen).astype(float))
+    assert found.min() > 0
+    inside = lit > 0.25 * lit.max()
+    assert np.abs(lit / found - 1)[inside].max() < 5 * within
+    assert np.std(lit / found) < within
+
+
 def test_a_given_scale_keeps_the_measured_background():
     stack = Stack(np.full((1, 1, 8, 6), 400, np.uint16))
     ready = prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale=1000, offset=100)

@@ -63,6 +63,7 @@ SCENES = {
 BUDGETS = {"whole": AMPLE, "batches": 2_500_000, "least": 1}
 USUAL = ("projection", "wave-2")
 DEAR = (
+    "wave-colours",
     "projection-cubic",
     "projection-many-images",
     "rays-cubic",

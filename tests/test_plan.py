@@ -16,6 +16,7 @@ from data_synthetic import Bead, CellPhantom, GaussianBall
 from recon.cli import main
 from recon.config.conversion import dump
 from recon.config.reading import load
+from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.planned import GROWTH, current, follow, strength
 from recon.fit.setup import Setup
 from recon.run import recorded
@@ -624,7 +625,7 @@ CONFIG = {
 }
 
 
-ADAM = {"method": "adam", "steps": 12, "checkpoint_every": 2, "start": "zero", "learning_rate": 2e-3, "tv": [60.0, 5.0]}
+ADAM = {"method": "adam", "steps": 8, "checkpoint_every": 2, "start": "zero", "learning_rate": 2e-3, "tv": [60.0, 5.0]}
 
 
 @pytest.fixture
@@ -699,12 +700,15 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
 
     assert run("reconstruct", path, "--out", tmp_path / "fit") == 0
     plans = json.loads((tmp_path / "fit" / "metrics.json").read_text())["plans"]
-    assert plans[0]["step"] == 1
-    assert len(plans) > 1  # from an empty volume it grows
+    if recipe is ADAM:
+        assert plans[0]["step"] == 1
+        assert len(plans) > 1  # from an empty volume it grows
+    else:
+        assert plans[0]["step"] == COARSE_STEPS + 1  # the coarse steps need none
     strengths = [made["strength"] for made in plans]
     assert all(b >= GROWTH * a for a, b in pairwise(strengths))
     text = (tmp_path / "fit" / "config.resolved.toml").read_text(encoding="utf-8")
-    assert text.startswith("# planned at step 1: ")
+    assert text.startswith(f"# planned at step {plans[0]['step']}: ")
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
@@ -721,7 +725,7 @@ def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypat
 
     def minimise(*arguments):
         for step in original(*arguments):
-            if step.number == 6:  # between two plans
+            if step.number == 4:  # after a plan, or before it
                 raise KeyboardInterrupt
             yield step
 
@@ -756,3 +760,21 @@ def test_strength_is_the_index_or_the_path_whichever_is_more():
     assert strength(torch.zeros(grid.shape), grid, 0.5) == 1
     assert strength(torch.full(grid.shape, 0.004), grid, 0.5) == pytest.approx(4.0)  # by |Δn|, OPD 0.02 µm: 2
     assert strength(torch.full((100, 4, 4), 0.004), Grid((100, 4, 4), (0.5, 0.2, 0.2)), 0.5) == pytest.approx(20.0)
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.filterwarnings("ignore")
+def test_without_a_specimen_the_stacks_linear_estimate_is_planned_on(write, tmp_path, capsys):
+    """Its plan is that of the specimen: the effects that matter are those of a volume as strong as it is."""
+    assert run("simulate", write(), "--out", tmp_path / "out") == 0
+    assert run("plan", write(), "--out", tmp_path / "known") == 0
+    path = write(specimen=None, data={"path": str(tmp_path / "out" / "stack.ome.tif")})
+    assert run("plan", path, "--out", tmp_path / "seen") == 0
+    assert "planned on the linear estimate" in capsys.readouterr().out
+    known, seen = (json.loads((tmp_path / name / "plan.json").read_text()) for name in ("known", "seen"))
+    assert seen["fidelity"]["propagation"] == known["fidelity"]["propagation"]
+    assert seen["met"]
+    resolved = tomllib.loads((tmp_path / "seen" / "config.resolved.toml").read_text(encoding="utf-8"))
+    assert resolved["data"]["path"].endswith("stack.ome.tif")
+    assert run("plan", write(specimen=None, data=None)) == 2
+    assert "missing key specimen or data.path" in capsys.readouterr().err

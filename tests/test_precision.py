@@ -15,6 +15,7 @@ import torch
 
 from data_synthetic import Bead, GaussianBall
 from recon.cli import main
+from recon.cli import work_precision as work_precision_command
 from recon.config.conversion import converter, dump
 from recon.config.reading import load
 from recon.report.fronts import MARKS, as_dict, draw_fronts, marks_of, write_csv
@@ -446,7 +447,8 @@ def test_command_leaves_csv_json_and_a_figure(run, tmp_path):
     code, _ = run(CONFIG)
     assert code == 0
     out = tmp_path / "out"
-    assert sorted(path.name for path in out.iterdir()) == [f"work_precision.{kind}" for kind in ("csv", "json", "png")]
+    left = [*(f"work_precision.{kind}" for kind in ("csv", "json", "png")), "config.resolved.toml"]
+    assert {path.name for path in out.iterdir()} == set(left)
     found = json.loads((out / "work_precision.json").read_text(encoding="utf-8"))
     straight, best = (converter.structure(trial, Trial) for trial in found["trials"])
     assert (straight.name, best.name) == ("projection 2", "best")
@@ -455,6 +457,22 @@ def test_command_leaves_csv_json_and_a_figure(run, tmp_path):
     assert 1e-3 < best.model_error < straight.model_error
     assert found["reference"]["projection"]["steps"] == 8
     assert (out / "work_precision.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_an_interrupted_command_keeps_what_it_has_measured(run, tmp_path, monkeypatch):
+    original = work_precision_command.trials
+
+    def stopped(*arguments, **options):
+        for number, trial in enumerate(original(*arguments, **options)):
+            if number == 1:
+                raise KeyboardInterrupt
+            yield trial
+
+    monkeypatch.setattr(work_precision_command, "trials", stopped)
+    code, told = run(CONFIG)
+    assert code == 130
+    assert "interrupted after 1 of 2 candidates" in told[-1]
+    assert (tmp_path / "out" / "work_precision.csv").read_text(encoding="utf-8").count("projection 2") == 1
 
 
 @pytest.mark.parametrize(

@@ -96,9 +96,9 @@ def test_along_z_the_faces_are_free():
 
 def test_total_variation_is_scikit_images(noisy):
     """Chambolle's algorithm of the same objective on a line, with ends of medium as that one isn't periodic."""
-    padded = torch.nn.functional.pad(noisy[1:2, 5:6], (300, 300))
-    found, _ = solved(padded, Majorant(edges=0.3), times=300)
-    theirs = denoise_tv_chambolle(padded[0, 0].numpy(), weight=0.3, eps=1e-12, max_num_iter=20000)
+    padded = torch.nn.functional.pad(noisy[1:2, 5:6], (100, 100))
+    found, _ = solved(padded, Majorant(edges=0.3), times=100)
+    theirs = denoise_tv_chambolle(padded[0, 0].numpy(), weight=0.3, eps=1e-12, max_num_iter=5000)
     torch.testing.assert_close(found[0, 0], torch.from_numpy(theirs), rtol=0, atol=2e-3)
 
 
@@ -135,7 +135,7 @@ MAJORANTS = {
     ("bounds", "majorant"),
     [
         pytest.param(bounds, majorant, id=f"{limits}-{name}", marks=() if (limits, name) in fast else pytest.mark.slow)
-        for fast in [{("free", "edges"), ("not below 0", "everything")}]
+        for fast in [{("not below 0", "everything")}]
         for limits, bounds in (("free", FREE), ("not below 0", Bounds()))
         for name, majorant in MAJORANTS.items()
     ],

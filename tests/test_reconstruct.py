@@ -2,6 +2,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -117,7 +118,7 @@ def other(workplace, tmp_path):
 
 
 def test_simulate_leaves_a_stack_and_its_picture(workplace):
-    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png"}
+    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png", "config.resolved.toml"}
     assert pictures.imread(workplace / "simulated" / "stack.png").std() > 0
 
 
@@ -224,9 +225,10 @@ def test_the_metrics_are_those_of_the_volume_left(workplace):
     assert [report["bias"] for report in metrics["prisms"]] == [1.5, -1.2]
 
 
+@pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
 def test_another_misfit_is_in_the_metrics_and_the_log_by_its_own_value(other, workplace, tmp_path, method):
-    given = {"newton": {}, "adam": {"tv": [60.0, 5.0], "prior": "tv"}}[method]
-    path, out = other({"reconstruction": {"steps": 12, "method": method, **given}}), tmp_path / "out"
+    given = {"newton": {"steps": 12}, "adam": {"steps": 8, "tv": [60.0, 5.0], "prior": "tv"}}[method]
+    path, out = other({"reconstruction": {"method": method, **given}}), tmp_path / "out"
     reconstruct.reconstruct(load(path), out, torch.device("cpu"), misfit=Absolute)
     config, found = load(path), volume(out)
     data = torch.from_numpy(read_stack(workplace / "simulated" / "stack.ome.tif").data)
@@ -267,11 +269,11 @@ def test_the_pictures_are_pictures(workplace):
         assert picture[..., :3].std() > 0.01
 
 
-def test_a_run_in_a_folder_of_results_replaces_them(other, tmp_path):
+def test_a_run_in_a_folder_of_results_replaces_them_where_asked(other, tmp_path):
     few = other({"reconstruction": {"steps": 3}})
     assert command("reconstruct", few, "--out", tmp_path / "out")[0] == 0
     few = other({"reconstruction": {"steps": 4}})
-    assert command("reconstruct", few, "--out", tmp_path / "out")[0] == 0
+    assert command("reconstruct", few, "--out", tmp_path / "out", "--restart")[0] == 0
     assert len(rows(tmp_path / "out")) == 4
     assert json.loads((tmp_path / "out" / "metrics.json").read_text(encoding="utf-8"))["steps"] == 4
     assert set(content(tmp_path / "out")) == RESULTS
@@ -330,7 +332,7 @@ def test_one_slice_of_one_2d_image_is_reconstructed(other, workplace, tmp_path, 
 
 
 def test_a_cameras_counts_are_flattened_and_scaled_to_the_models_unit(other, tmp_path):
-    wide = {"volume": {"shape": [5, 36, 32]}, "reconstruction": {"steps": 8}}
+    wide = {"volume": {"shape": [5, 36, 32]}, "reconstruction": {"steps": 5}}
     simulated = {"data": {"path": str(tmp_path / "simulated" / "stack.ome.tif")}}
     assert command("simulate", other(wide), "--out", tmp_path / "simulated")[0] == 0
     assert command("reconstruct", other(wide | simulated), "--out", tmp_path / "clean")[0] == 0
@@ -389,7 +391,7 @@ def test_bad_input_leaves_earlier_results_alone(other, earlier, tmp_path):
 def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
     before = content(earlier)
     path = other({"reconstruction": {"method": "adam", "learning_rate": 1e30}})
-    code, err = command("reconstruct", path, "--out", earlier)
+    code, err = command("reconstruct", path, "--out", earlier, "--restart")
     assert code == 1
     assert "torchdic: error: the descent diverged at step 2: " in err
     assert "Traceback" not in err
@@ -438,6 +440,7 @@ def interrupted(path, out, number, wanted=12):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::recon.report.verdict.PoorFitWarning")  # 120 steps of Adam leave 2 % unexplained
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
 def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp_path, name):
     path, whole = long
@@ -446,7 +449,7 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     done = len(rows(out))
     assert 12 <= done < LONG
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
-    early = {"log.csv"} if name == "SIGKILL" else {"log.csv", "volume.ome.tif"}  # the volume so far
+    early = {"log.csv", "checkpoint.pt"} | (set() if name == "SIGKILL" else {"volume.ome.tif"})  # the volume so far
     assert RESULTS & set(content(out)) == early  # no other result is there before its time
     if name == "SIGKILL":
         assert code == -signal.SIGKILL
@@ -464,23 +467,24 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     assert {name for name in content(out) if not name.startswith(".")} == RESULTS
 
 
+def interrupt_at(patch, number):
+    """Make the next descent stop with KeyboardInterrupt when it would take a step."""
+    original = recorded.minimise
+
+    def minimise(*arguments):
+        for step in original(*arguments):
+            if step.number == number:
+                patch.setattr(recorded, "minimise", original)
+                raise KeyboardInterrupt
+            yield step
+
+    patch.setattr(recorded, "minimise", minimise)
+
+
 @pytest.fixture
 def interrupt(monkeypatch):
-    """A function that makes the next descent stop with KeyboardInterrupt when it would take a step."""
-
-    def at(number):
-        original = recorded.minimise
-
-        def minimise(*arguments):
-            for step in original(*arguments):
-                if step.number == number:
-                    monkeypatch.setattr(recorded, "minimise", original)
-                    raise KeyboardInterrupt
-                yield step
-
-        monkeypatch.setattr(recorded, "minimise", minimise)
-
-    return at
+    """A function from a step to where the next descent stops."""
+    return lambda number: interrupt_at(monkeypatch, number)
 
 
 class Doomed:
@@ -509,14 +513,25 @@ def test_a_signal_is_heeded_where_python_ignores_what_it_raises(other, tmp_path,
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.fixture(scope="module")
+def eight(workplace):
+    """The folders of a run of 8 steps that was interrupted after its third, and of one that was not."""
+    path = workplace / "eight.toml"
+    path.write_text(merged({"reconstruction": {"steps": 8}}), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "save", lambda _, picture: picture.touch())
+        interrupt_at(patch, 4)
+        assert command("reconstruct", path, "--out", workplace / "stopped")[0] == 130
+        assert set(content(workplace / "stopped")) == {"log.csv", "checkpoint.pt", "volume.ome.tif"}
+        assert command("reconstruct", path, "--out", workplace / "eight")[0] == 0
+    return workplace / "stopped", workplace / "eight"
+
+
 @pytest.fixture
-def stopped(other, interrupt, tmp_path):
+def stopped(other, eight, tmp_path):
     """(configuration, folder) of a run of 8 steps that was interrupted after its third."""
-    path, out = other({"reconstruction": {"steps": 8}}), tmp_path / "out"
-    interrupt(4)
-    assert command("reconstruct", path, "--out", out)[0] == 130
-    assert set(content(out)) == {"log.csv", "checkpoint.pt", "volume.ome.tif"}
-    return path, out
+    shutil.copytree(eight[0], tmp_path / "out")
+    return other({"reconstruction": {"steps": 8}}), tmp_path / "out"
 
 
 def test_a_run_that_dies_between_checkpoints_goes_on_from_the_last(other, monkeypatch, workplace, tmp_path):
@@ -557,12 +572,15 @@ def test_an_interrupted_run_leaves_earlier_results_alone(other, interrupt, tmp_p
     before = content(out)
     interrupt(3)
     path = other({"reconstruction": {"steps": 5}})
-    code, err = command("reconstruct", path, "--out", out)
+    code, err = command("reconstruct", path, "--out", out, "--restart")
     assert code == 130
     assert "interrupted after step 2 of 5; go on with --resume; volume.interrupted.ome.tif holds Δn so far" in err
     after = content(out)
-    assert after.keys() - before.keys() == {"checkpoint.pt", "volume.interrupted.ome.tif"}
-    assert {name for name in before if before[name] != after[name]} <= {"log.csv"}
+    assert after.keys() - before.keys() == {"volume.interrupted.ome.tif"}
+    assert {name for name in before if before[name] != after[name]} <= {"log.csv", "checkpoint.pt"}
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 2
+    assert "an interrupted run; go on with --resume" in err
     assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
     assert set(content(out)) == RESULTS
 
@@ -579,13 +597,43 @@ def test_an_interrupted_run_is_not_overwritten_unasked(stopped):
 
 
 @pytest.mark.parametrize("option", ["--resume", "--restart"])
-def test_an_interrupted_run_goes_on_or_begins_anew_where_asked(stopped, tmp_path, option):
+def test_an_interrupted_run_goes_on_or_begins_anew_where_asked(stopped, eight, option):
     path, out = stopped
-    assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0
     assert command("reconstruct", path, "--out", out, option)[0] == 0
-    assert torch.equal(volume(out), volume(tmp_path / "whole"))
+    assert torch.equal(volume(out), volume(eight[1]))
     assert [row["step"] for row in rows(out)] == list("12345678")
     assert set(content(out)) == RESULTS
+
+
+def test_a_finished_run_is_not_overwritten_unasked(other, tmp_path):
+    path, out = other({"reconstruction": {"steps": 2}}), tmp_path / "out"
+    assert command("reconstruct", path, "--out", out)[0] == 0
+    before = content(out)
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert "checkpoint.pt: a finished run; go on with more steps and --resume, or begin anew with --restart" in err
+    assert content(out) == before
+    (out / "checkpoint.pt").unlink()
+    code, err = command("reconstruct", path, "--out", out, "--resume")
+    assert code == 2
+    assert "metrics.json: the folder has results; name another one, or replace them with --restart" in err
+    assert command("reconstruct", path, "--out", out, "--restart")[0] == 0
+
+
+def test_a_finished_run_goes_on_with_more_steps(other, workplace, tmp_path):
+    """As if it had had them from the start: the weight follows the noise, not the number of steps."""
+    out = tmp_path / "out"
+    whole = rows(workplace / "whole")
+    half = len(whole) - 3
+    assert command("reconstruct", other({"reconstruction": {"steps": half}}), "--out", out)[0] == 0
+    assert len(rows(out)) == half
+    assert command("reconstruct", other(), "--out", out, "--resume")[0] == 0
+    assert torch.equal(volume(out), volume(workplace / "whole"))
+    assert [row["misfit"] for row in rows(out)] == [row["misfit"] for row in whole]
+    assert command("reconstruct", other(), "--out", out, "--resume")[0] == 0  # nothing is left to do
+    assert torch.equal(volume(out), volume(workplace / "whole"))
+    assert len(rows(out)) == len(whole)
 
 
 def test_resume_without_an_interrupted_run_begins_one(other, tmp_path):
@@ -594,13 +642,13 @@ def test_resume_without_an_interrupted_run_begins_one(other, tmp_path):
     assert len(rows(tmp_path / "out")) == 2
 
 
-@pytest.mark.filterwarnings("ignore::recon.report.verdict.PoorFitWarning")  # twelve steps of Adam
+@pytest.mark.filterwarnings("ignore::recon.report.verdict.PoorFitWarning")  # seven steps of Adam
 @pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
 def test_a_run_may_be_interrupted_again_and_again(other, interrupt, tmp_path, method):
-    path, out = other({"reconstruction": {"method": method, "steps": 12}}), tmp_path / "out"
+    path, out = other({"reconstruction": {"method": method, "steps": 7}}), tmp_path / "out"
     assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0
     last = len(rows(tmp_path / "whole"))
-    for number in (2, 3, 6, last):
+    for number in (2, 3, last):
         interrupt(number)
         assert command("reconstruct", path, "--out", out, "--resume")[0] == 130
         assert [int(row["step"]) for row in rows(out)] == list(range(1, number))
@@ -637,7 +685,6 @@ def test_an_interruption_among_the_results_goes_on_from_the_last_checkpoint(othe
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"reconstruction": {"steps": 9}}, "reconstruction.steps was 8, is 9"),
         pytest.param(
             {"reconstruction": {"steps": 8, "tv": [50.0, 5.0]}},
             "reconstruction.tv was 'auto', is [50.0, 5.0]",
@@ -665,9 +712,8 @@ def test_a_run_with_another_misfit_is_not_gone_on_with(stopped):
         reconstruct.reconstruct(load(path), out, torch.device("cpu"), resume=True, misfit=Absolute)
 
 
-def test_what_the_descent_does_not_see_may_change_before_it_goes_on(stopped, other, workplace, tmp_path):
-    path, out = stopped
-    assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0
+def test_what_the_descent_does_not_see_may_change_before_it_goes_on(stopped, eight, other, workplace, tmp_path):
+    _, out = stopped
     moved = tmp_path / "moved.tif"
     moved.write_bytes((workplace / "simulated" / "stack.ome.tif").read_bytes())
     changes = {
@@ -677,7 +723,7 @@ def test_what_the_descent_does_not_see_may_change_before_it_goes_on(stopped, oth
         "simulation": {"seed": 5},
     }
     assert command("reconstruct", other(changes), "--out", out, "--resume")[0] == 0
-    assert torch.equal(volume(out), volume(tmp_path / "whole"))
+    assert torch.equal(volume(out), volume(eight[1]))
 
 
 def test_changed_data_do_not_go_on_with_anothers_run(workplace, other, interrupt, tmp_path):

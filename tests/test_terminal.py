@@ -58,11 +58,22 @@ def test_a_stream_of_another_kind_and_none_stay_as_they_are(monkeypatch):
     write_plainly()
 
 
-def test_the_installed_command_explains_itself_in_ascii(tmp_path):
-    script = Path(sys.executable).with_name("torchdic")
-    for arguments in (["--help"], ["reconstruct", "--help"], ["plan", str(tmp_path / "µ.toml")]):
-        done = subprocess.run(
-            [script, *arguments], capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii"}, check=False
-        )
-        assert b"UnicodeEncodeError" not in done.stderr
-        assert done.returncode in (0, 2)
+@pytest.mark.parametrize("arguments", [["--help"], ["reconstruct", "--help"]], ids=" ".join)
+def test_help_reaches_a_terminal_without_its_signs(terminal, arguments):
+    raw = terminal("ascii")
+    with pytest.raises(SystemExit) as done:
+        main(arguments)
+    assert done.value.code == 0
+    assert b"usage: torchdic" in raw.getvalue()
+
+
+def test_the_installed_command_answers_in_ascii(tmp_path):
+    done = subprocess.run(
+        [Path(sys.executable).with_name("torchdic"), "plan", str(tmp_path / "µ.toml")],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=False,
+    )
+    assert b"No such file or directory" in done.stderr
+    assert b"UnicodeEncodeError" not in done.stderr
+    assert done.returncode == 2

@@ -41,10 +41,10 @@ def device(parser: argparse.ArgumentParser) -> None:
 
 
 def earlier_run(parser: argparse.ArgumentParser) -> None:
-    """What to do with an interrupted run that is found in the folder."""
+    """What to do with an earlier run that is found in the folder."""
     choice = parser.add_mutually_exclusive_group()
-    choice.add_argument("--resume", action="store_true", help="continue the interrupted run in DIR, if there is one")
-    choice.add_argument("--restart", action="store_true", help="start again and discard an interrupted run in DIR")
+    choice.add_argument("--resume", action="store_true", help="go on with the run in DIR, if there is one")
+    choice.add_argument("--restart", action="store_true", help="start again and replace the run in DIR")
 
 
 def fit(parser: argparse.ArgumentParser) -> None:

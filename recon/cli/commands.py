@@ -10,13 +10,14 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
-from recon.config.schema import ConfigError
+from recon.cli.own_stack import new, phase
+from recon.config.schema import AssumedWarning, ConfigError
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
 from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
-from torchdic.errors import SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
@@ -24,11 +25,12 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its help in one line, the function that runs it, and the arguments that it takes."""
+    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names."""
 
     help: str
     run: Callable[[argparse.Namespace], None]
     arguments: tuple[Callable[[argparse.ArgumentParser], None], ...]
+    aliases: tuple[str, ...] = ()
 
 
 COMMANDS = {
@@ -41,6 +43,17 @@ COMMANDS = {
         "simulate the DIC images of a known specimen",
         simulate.run,
         (arguments.config, arguments.out, arguments.device),
+    ),
+    "new": Command(
+        "write a configuration for a recorded stack, from its file and its images",
+        new.run,
+        (new.arguments,),
+        ("init",),
+    ),
+    "phase": Command(
+        "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
+        phase.run,
+        (phase.arguments,),
     ),
     "plan": Command(
         "find the fastest way to compute images within a tolerance, and which effects matter",
@@ -105,7 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     arguments.version(parser)
     found = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
-        below = found.add_parser(name, help=command.help, description=f"{command.help[0].upper()}{command.help[1:]}.")
+        words = f"{command.help[0].upper()}{command.help[1:]}."
+        below = found.add_parser(name, help=command.help, description=words, aliases=list(command.aliases))
         below.set_defaults(run=command.run)
         for add in command.arguments:
             add(below)
@@ -113,19 +127,21 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _show_each_warning_once() -> None:
-    """Show each warning once, as one line above the progress bar.
+    """Show each warning once, as one line above the progress bar; of each kind about images, the first.
 
-    Python's own rule "once" would show a warning again for each module that it comes from.
+    Python's own rule "once" would show a warning again for each module that it comes from. A descent's images change
+    from step to step, and with them the digits of a warning about them.
     """
-    shown: set[str] = set()
+    shown: set[object] = set()
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        if str(message) not in shown:
-            shown.add(str(message))
+        kind = type(message) if isinstance(message, BatchWarning) else str(message)
+        if kind not in shown:
+            shown.add(kind)
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show
-    for kind in (ApertureWarning, SamplingWarning, ToleranceWarning):
+    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning):
         warnings.simplefilter("always", kind)
 
 

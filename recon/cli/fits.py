@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from recon.cli.specimens import specimen_of
 from recon.config.reading import load
+from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.step import Step
 from recon.report import figures
@@ -33,6 +34,7 @@ def run(options: argparse.Namespace) -> None:
     candidates = fits_of(config)
     recorded = _recorded(config, str(options.config), options.device)
     prepare_folder(options.out)
+    leave_resolved(config, options.out)
     kept = KeptTrials(options.out, recorded)
     kept.found(resume=options.resume, restart=options.restart)
     _try_each(recorded, candidates, kept)

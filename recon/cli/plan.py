@@ -2,10 +2,18 @@
 
 import argparse
 
+import torch
+
 import torchdic
 from recon.cli.specimens import specimen_of, voxels
 from recon.config.reading import load
+from recon.config.resolved import leave_resolved
+from recon.config.schema import Config, ConfigError
+from recon.earlier.tikhonov import tikhonov
+from recon.fit.setup import Setup, empty_medium
+from recon.run.data import load_data
 from recon.run.reconstruct import prepare_folder
+from torchdic import Volume
 from torchdic.files.whole import write_json
 
 # The tolerance of a configuration that names none.
@@ -13,14 +21,36 @@ USUAL_TOLERANCE = 0.01
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the plan of the configuration's specimen; leave it as plan.json if a folder is given."""
+    """Print the plan of the configuration's specimen, or of a first estimate of the one behind its stack.
+
+    With a folder the plan is left there as plan.json, beside the configuration.
+    """
     config = load(options.config)
-    specimen = specimen_of(config, str(options.config))
     tolerance = USUAL_TOLERANCE if config.tolerance is None else config.tolerance
-    volume = voxels(specimen, config.volume.grid, options.device)
+    if config.specimen is None:
+        volume = _first_estimate(config, str(options.config), options.device)
+    else:
+        volume = voxels(specimen_of(config, str(options.config)), config.volume.grid, options.device)
     if options.out is not None:
         prepare_folder(options.out)
     planned = torchdic.plan(volume, config.microscope, config.acquisition, tolerance)
     print(planned.table())
     if options.out is not None:
         write_json(options.out / "plan.json", planned.as_dict())
+        leave_resolved(config, options.out)
+
+
+def _first_estimate(config: Config, source: str, device: torch.device) -> Volume:
+    """The volume whose linear images explain the stack, which stands for a specimen that isn't known."""
+    if config.data is None:
+        raise ConfigError(f"{source}: missing key specimen or data.path: a plan needs a known specimen or a stack")
+    measured = load_data(config)
+    data = torch.from_numpy(measured.data).to(device)
+    medium = empty_medium(config.volume.grid, config.volume.background, data)
+    setup = Setup(medium, config.microscope, config.acquisition)
+    try:
+        found = tikhonov(data, setup, measured.noise, config.reconstruction.bounds)
+    except ValueError as error:
+        raise ConfigError(f"{source}: no first estimate of the specimen for a plan: {error}") from error
+    print(f"{config.data.path}: planned on the linear estimate of its specimen")
+    return Volume(medium.grid, found.delta, medium.background)

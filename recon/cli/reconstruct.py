@@ -2,10 +2,11 @@
 
 import argparse
 import signal
+import warnings
 from typing import Any, NoReturn
 
 from recon.config.reading import load
-from recon.config.schema import ConfigError
+from recon.config.schema import AssumedWarning, ConfigError
 from recon.run.reconstruct import reconstruct
 
 
@@ -15,6 +16,13 @@ def run(options: argparse.Namespace) -> None:
     config = load(options.config)
     if config.data is None:
         raise ConfigError(f"{options.config}: missing key data.path: a reconstruction needs a stack")
+    if config.assumed:
+        warnings.warn(
+            f"{options.config}: assumed, not known: {', '.join(config.assumed)}; the volume is as wrong as they are. "
+            "Correct them, and take their names out of `assumed`",
+            AssumedWarning,
+            stacklevel=2,
+        )
     result = reconstruct(config, options.out, options.device, resume=options.resume, restart=options.restart)
     delta: Any = result.metrics["delta"]
     print(

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
-from recon.config.conversion import dump
 from recon.config.reading import load
+from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.planned import announce
 from recon.report import figures
@@ -20,7 +20,7 @@ from recon.run.exact_images import exact_images
 from recon.run.reconstruct import prepare_folder
 from torchdic import STANDARD, Fidelity, Volume, image, plan
 from torchdic.files.stack import write_stack
-from torchdic.files.whole import write_json, write_text
+from torchdic.files.whole import write_json
 from torchdic.forward.foresee import check_fits
 
 
@@ -31,6 +31,8 @@ def run(options: argparse.Namespace) -> None:
     if config.simulation.exact and config.tolerance is not None:
         raise ConfigError(f"{options.config}: tolerance: simulation.exact leaves nothing to plan")
     check_exact_field(config, specimen, str(options.config))
+    if config.simulation.exact or config.tolerance is None:
+        config = replace(config, fidelity=config.fidelity or STANDARD)
     if config.simulation.exact:
         images = _from_the_exact_field(config, specimen, options.out)
     else:
@@ -40,15 +42,16 @@ def run(options: argparse.Namespace) -> None:
 
 def _from_the_exact_field(config: Config, specimen: Any, out: Path) -> Tensor:
     prepare_folder(out)
-    fidelity = config.fidelity or STANDARD
-    return exact_images(specimen, config.volume.grid, config.microscope, config.acquisition, fidelity)
+    assert config.fidelity is not None
+    return exact_images(specimen, config.volume.grid, config.microscope, config.acquisition, config.fidelity)
 
 
 @torch.no_grad()
 def _by_a_propagation(config: Config, specimen: Any, out: Path, device: torch.device) -> Tensor:
     volume = voxels(specimen, config.volume.grid, device)
-    fidelity = config.fidelity or STANDARD
     if config.tolerance is None:
+        assert config.fidelity is not None
+        fidelity = config.fidelity
         check_fits(volume, config.microscope, config.acquisition, fidelity)  # before the folder is made
         prepare_folder(out)
     else:
@@ -63,7 +66,7 @@ def _planned(config: Config, volume: Volume, tolerance: float, out: Path) -> Fid
     print(f"{announce(planned)}, predicted {planned.seconds:.2g} s", flush=True)
     write_json(out / "plan.json", planned.as_dict())
     resolved = replace(config, fidelity=planned.fidelity, tolerance=None)
-    write_text(out / "config.resolved.toml", f"# {announce(planned)}\n{dump(resolved)}")
+    leave_resolved(resolved, out, announce(planned))
     return planned.fidelity
 
 
@@ -79,6 +82,8 @@ def _write(config: Config, images: Tensor, out: Path) -> None:
     data = images.float() if images.is_floating_point() else images
     write_stack(out / "stack.ome.tif", data, pixel, equal_step(focus))
     figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), out / "stack.png")
+    if config.tolerance is None:  # otherwise the plan has left it
+        leave_resolved(config, out)
     prisms, planes, ny, nx = images.shape
     print(f"{out / 'stack.ome.tif'}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")
 

@@ -38,7 +38,7 @@ def specimen_of(config: Config, source: str) -> Any:
     the volume's, or its exact field is asked for and isn't known.
     """
     if config.specimen is None:
-        raise ConfigError(f"{source}: missing key specimen: a simulation or plan needs one")
+        raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
     values = dict(config.specimen)
     kind = values.pop("kind", None)
     if not isinstance(kind, str) or kind not in SPECIMENS:

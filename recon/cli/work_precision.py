@@ -10,10 +10,12 @@ from tqdm import tqdm
 from recon.cli import fits
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
+from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.report import figures
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.run.exact_images import exact_images
+from recon.run.interruption import InterruptedRunError
 from recon.run.reconstruct import prepare_folder
 from torchdic import Candidate, Fidelity, Trial
 from torchdic.files.whole import write_json
@@ -38,15 +40,28 @@ def run(options: argparse.Namespace) -> None:
     candidates = config.candidates or ladder(grid, padded=not reaches_a_side(volume))
     reference = _references(config, candidates)
     prepare_folder(options.out)
+    leave_resolved(replace(config, candidates=candidates), options.out)
     exact = None
     if hasattr(specimen, "field"):
         # the exact field is lit from as many directions as the truth that it replaces
         lit = reference[TRUTH]
         exact = exact_images(specimen, grid, microscope, acquisition, lit).to(options.device)
+    print("the truth: converged images and their gradient …", flush=True)
     steps = trials(
         volume, microscope, acquisition, candidates, reference, exact=exact, repeats=config.work_precision.repeats
     )
-    found = list(tqdm(steps, desc="work-precision", total=len(candidates), unit="candidate"))
+    found: list[Trial] = []
+    try:
+        for trial in tqdm(steps, desc="work-precision", total=len(candidates), unit="candidate"):
+            found.append(trial)
+            write_csv(options.out / "work_precision.csv", found)
+    except KeyboardInterrupt:
+        if not found:
+            raise
+        raise InterruptedRunError(
+            f"interrupted after {len(found)} of {len(candidates)} candidates; "
+            f"{options.out / 'work_precision.csv'} holds what was measured"
+        ) from None
     _write(found, reference, str((config.specimen or {})["kind"]), options.out)
 
 

@@ -265,7 +265,7 @@ FIELDS: dict[type, dict[str, Hook]] = {
         **dict.fromkeys(("methods", "propagations"), _array_of(_string)),
         **dict.fromkeys(("directions", "planes"), _array_of(_whole_number)),
     },
-    Config: {"candidates": _array_of(_candidate)},
+    Config: {"candidates": _array_of(_candidate), "assumed": _array_of(_string)},
 }
 
 for _type, _hook in TYPES.items():

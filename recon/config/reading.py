@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import tomllib
 import warnings
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,6 +12,7 @@ from cattrs import transform_error
 from cattrs.errors import ForbiddenExtraKeysError
 
 from recon.config.conversion import converter
+from recon.config.encoding import decoded
 from recon.config.including import INCLUDE, values_of
 from recon.config.schema import Config, ConfigError, UnitsWarning
 from recon.config.spelling import FURTHER, canonical, unknown_key
@@ -32,6 +34,27 @@ def load(path: str | os.PathLike[str]) -> Config:
         raise ConfigError(f"{path}: {error}") from error
     # what is wrong may stand in any of them
     source = f"{path} (with {', '.join(file.name for file in included)})" if included else str(path)
+    config = _configuration(values, source)
+    if config.data is not None and not config.data.files:
+        raise ConfigError(f"{source}: missing key data.path")
+    _warn_of_long_shears(config, path)
+    return config
+
+
+def parse(content: bytes, source: str) -> Config:
+    """A configuration from the bytes of its file. source: the file's name, with which messages begin.
+
+    Relative paths stay as they are. Raises ConfigError as `load` does.
+    """
+    try:
+        values = tomllib.loads(decoded(content))
+    except ValueError as error:  # TOMLDecodeError is one
+        raise ConfigError(f"{source}: is not TOML: {error}") from error
+    return _configuration(values, source)
+
+
+def _configuration(values: dict[str, Any], source: str) -> Config:
+    """The configuration of a file's values. Raises ConfigError as `load` does."""
     wrong = wrong_unit(values)
     if wrong is not None:
         raise ConfigError(f"{source}: {wrong}")
@@ -39,11 +62,7 @@ def load(path: str | os.PathLike[str]) -> Config:
         values = canonical(values)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{source}: {error}") from error
-    config = structure(values, Config, source)
-    if config.data is not None and not config.data.files:
-        raise ConfigError(f"{source}: missing key data.path")
-    _warn_of_long_shears(config, path)
-    return config
+    return structure(values, Config, source)
 
 
 def _warn_of_long_shears(config: Config, path: Path) -> None:

@@ -15,6 +15,10 @@ class ConfigError(ValueError):
     """A configuration can't be used. The message is one line with the file, the key, the value and the law."""
 
 
+class AssumedWarning(UserWarning):
+    """A configuration holds values that nobody has said."""
+
+
 class UnitsWarning(UserWarning):
     """A value in a configuration is so large that another unit was likely meant."""
 
@@ -288,6 +292,7 @@ class Config:
     tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
         `torchdic.planning.work_precision.ladder`.
+    assumed: names of values that nobody has said, which a reconstruction warns of; see `torchdic new`.
     Raises ValueError where both fidelity and tolerance are given, for a tolerance not above 0, for an aperture that
     no lens has, for a condenser of which no light enters the medium, for a bead of the medium's index, and for an empty
     list of candidates.
@@ -305,6 +310,7 @@ class Config:
     tolerance: float | None = None
     candidates: Sequence[Candidate] | None = None
     work_precision: WorkPrecisionSection = field(default_factory=WorkPrecisionSection)
+    assumed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.tolerance is not None:

@@ -45,6 +45,11 @@ class GivenFidelity:
             return replace(self.fidelity, sources=self.draft_sources), plans
         return self.careful(step, setup, plans)
 
+    @property
+    def coarse(self) -> Fidelity:
+        """The fidelity that Newton's first, coarse steps are drafts of."""
+        return self.fidelity
+
     def careful(
         self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]
     ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
@@ -73,6 +78,14 @@ class PlannedFidelity:
     ) -> tuple[Fidelity, tuple[PlanRecord, ...]]:
         """The fidelity of a step of Adam's, counted from 0, and the plans so far with the one made for it."""
         return self.careful(step, setup, plans)
+
+    @property
+    def coarse(self) -> Fidelity:
+        """The fidelity that Newton's first, coarse steps are drafts of: the wave, whatever is planned after them.
+
+        A plan for a volume that is all but empty costs as much as several steps, and is soon made again.
+        """
+        return Fidelity()
 
     def careful(
         self, step: int, setup: Setup, plans: tuple[PlanRecord, ...]
@@ -105,7 +118,7 @@ def follow(plans: tuple[PlanRecord, ...], step: int, setup: Setup, tolerance: fl
     now = strength(volume.delta, volume.grid, microscope.wavelength)
     if plans and now < GROWTH * plans[-1]["strength"]:
         return plans
-    made = plan(volume, microscope, setup.acquisition, tolerance)
+    made = plan(volume, microscope, setup.acquisition, tolerance, with_effects=False)
     record = {
         "step": step + 1,
         "strength": now,

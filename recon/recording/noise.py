@@ -87,20 +87,20 @@ def noise_of_level(
     gives None for fewer than 4 levels, a gain that is uncertain by more than a tenth, and noise that falls to nothing
     far above intensity 0, where dark counts are left.
     """
-    levels, variances, blocks = _variances(images, mask)
+    levels, variances, blocks = variances_of_levels(images, mask)
     if len(levels) < 4:
         return None
     straight = np.stack([np.ones_like(levels), levels], axis=1)
-    (intercept, slope), error = _robust_fit(straight, variances, blocks)
+    (intercept, slope), error = fitted_line(straight, variances, blocks)
     if intercept < -3 * error[0] or not slope > error[1] / _UNSURE:
         return None
     if intercept < 0:
-        line, _ = _robust_fit(straight[:, 1:], variances, blocks)
+        line, _ = fitted_line(straight[:, 1:], variances, blocks)
         intercept, slope = 0.0, line[0]
     return NoiseModel(float(slope), math.sqrt(intercept))
 
 
-def _variances(images: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def variances_of_levels(images: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean level of each bin that has enough blocks, the noise's variance there, and the number of its blocks."""
     found = list(_blocks(images, mask))
     levels = np.concatenate([level for level, _ in found])
@@ -143,7 +143,7 @@ def _blocks(images: np.ndarray, mask: np.ndarray | None) -> Iterator[tuple[np.nd
         yield level[known].mean(1), magnitude[known].astype(np.float32)
 
 
-def _robust_fit(basis: np.ndarray, variances: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fitted_line(basis: np.ndarray, variances: np.ndarray, blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of a fit to variances, and their standard errors.
 
     The scatter of a variance is proportional to the fitted one and falls with the root of the blocks' number.

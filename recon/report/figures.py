@@ -21,6 +21,9 @@ DPI = 150
 # Focus planes that a picture of a whole stack shows at most.
 MOST_PLANES = 7
 
+# Parts of the pixels that are darker and brighter than the scale of grey: a few hot pixels don't decide it.
+OUTSIDE = 0.002
+
 # Mean width of a letter of 8 points.
 INCHES_PER_LETTER = 0.062
 
@@ -63,9 +66,9 @@ def draw_images(
     figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
     axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
     residual = measured - modelled
-    largest = float(residual[:, planes].abs().max())
+    _, largest = _limits(residual[:, planes].abs())
     for p, prism in enumerate(prisms):
-        grey = ("gray", (float(measured[p].min()), float(measured[p].max())))
+        grey = ("gray", _limits(measured[p]))
         kinds = {
             "measured": (measured, *grey),
             "modelled": (modelled, *grey),
@@ -77,7 +80,7 @@ def draw_images(
                 _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
                 if p == 0:
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
-            _scale_bar(trio[0], grid.extent[2], "white")
+            scale_bar(trio[0], grid.extent[2], "white")
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
         figure.colorbar(axes[p, -1].images[0], ax=axes[p, -1], label="residual")
     return figure
@@ -124,7 +127,7 @@ def draw_sections(
             shown = _show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
             ax.set_ylabel(name[1], fontsize=8, labelpad=1)
-            _scale_bar(ax, size[name[0]], "white")
+            scale_bar(ax, size[name[0]], "white")
         column[0].set_title(title, fontsize=9)
     assert shown is not None
     figure.colorbar(shown, ax=axes, label="Δn")
@@ -159,7 +162,7 @@ def draw_stack(
     figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
     for p, prism in enumerate(prisms):
-        limits = float(stack[p].min()), float(stack[p].max())
+        limits = _limits(stack[p])
         for ax, f in zip(axes[p], planes, strict=True):
             _show(ax, stack[p, f], spacing, "gray", limits)
             if p == 0:
@@ -168,8 +171,14 @@ def draw_stack(
         bar.set_label("intensity", fontsize=8)
         bar.ax.tick_params(labelsize=7)
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
-        _scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
+        scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
     return figure
+
+
+def _limits(images: Tensor) -> tuple[float, float]:
+    """The values between which images are shown: all but the OUTSIDE part of their pixels at either end."""
+    low, high = np.quantile(images.detach().cpu().numpy(), (OUTSIDE, 1 - OUTSIDE))
+    return float(low), float(high)
 
 
 def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: tuple[float, float]):
@@ -187,7 +196,7 @@ def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: 
     return shown
 
 
-def _scale_bar(ax: Axes, width: float, colour: str) -> None:
+def scale_bar(ax: Axes, width: float, colour: str) -> None:
     """Add a bar of 1, 2 or 5 times a power of ten in µm, at most a quarter of the picture's width (µm) long."""
     power = 10.0 ** np.floor(np.log10(width / 4))
     length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)

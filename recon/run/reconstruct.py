@@ -22,7 +22,7 @@ from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data, load_support
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, descend_recorded
-from recon.run.results import Result, ResultsError, write_results
+from recon.run.results import INTERRUPTED, METRICS, Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
 from torchdic.files.whole import written_whole
@@ -48,7 +48,8 @@ def reconstruct(
 ) -> Result:
     """Fit a volume to the configuration's stack and leave it in `out`, with metrics, log, configuration and figures.
 
-    resume: go on from the checkpoint in `out`, if there is one. restart: begin anew although there is one.
+    resume: go on from the checkpoint in `out`, if there is one; a finished run goes on where more steps are asked for.
+    restart: begin anew although there are a checkpoint or results.
     misfit: makes the misfit that is lowered from the prepared stack (prism, focus, y, x); None is the configuration's.
     Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
     the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint and the volume so far saved;
@@ -61,7 +62,7 @@ def reconstruct(
     made = misfit or misfit_for(config, measured)
     problem = problem_of(config, data, made, measured)
     identity = _identity(config, measured, problem)
-    start = _checkpoint_to_resume(out / CHECKPOINT, identity, resume=resume, restart=restart)
+    start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
     sections = None
     if config.reconstruction.method in DIRECT:
         try:
@@ -74,13 +75,11 @@ def reconstruct(
         check_room_for_descent(problem, made)
         prepare_folder(out)
         ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
+    kept = config.reconstruction.method not in DIRECT and save_if_possible(out / CHECKPOINT, ended)
     try:
-        result = write_results(out, config, measured, problem, ended, sections)
+        return write_results(out, config, measured, problem, ended, sections)
     except ResultsError as error:
-        kept = config.reconstruction.method not in DIRECT and save_if_possible(out / CHECKPOINT, ended)
         raise ResultsError(f"{error}{'; make room and go on with --resume' if kept else ''}") from error
-    (out / CHECKPOINT).unlink(missing_ok=True)
-    return result
 
 
 def prepare_folder(out: Path) -> None:
@@ -143,7 +142,8 @@ def _identity(config: Config, measured: Measured, problem: Problem) -> str:
         specimen=None,
         calibration=CalibrationSection(),
         simulation=SimulationSection(),
-        reconstruction=replace(config.reconstruction, checkpoint_every=1, support=None),
+        # with more steps it is the same one, prolonged
+        reconstruction=replace(config.reconstruction, steps=None, checkpoint_every=1, support=None),
     )
     support = problem.support
     digests = {
@@ -159,12 +159,23 @@ def _digest(array: np.ndarray) -> str:
     return hashlib.sha256(array.tobytes()).hexdigest()
 
 
-def _checkpoint_to_resume(saved: Path, identity: str, *, resume: bool, restart: bool) -> Checkpoint | None:
-    """The checkpoint to go on from, None to begin anew. Raises CheckpointError where the user must choose."""
-    if not saved.exists():
-        return None
-    if resume:
-        return checkpoint.load(saved, identity)
-    if not restart:
-        raise CheckpointError(f"{saved}: an interrupted run; go on with --resume or begin anew with --restart")
+def _checkpoint_to_resume(out: Path, identity: str, *, resume: bool) -> Checkpoint | None:
+    """The checkpoint to go on from, None to begin in a folder without one.
+
+    Raises CheckpointError where the folder holds an earlier run, and the user must choose.
+    """
+    saved, finished = out / CHECKPOINT, (out / METRICS).exists() and not (out / INTERRUPTED).exists()
+    if saved.exists():
+        if resume:
+            return checkpoint.load(saved, identity)
+        which = (
+            "a finished run; go on with more steps and --resume"
+            if finished
+            else "an interrupted run; go on with --resume"
+        )
+        raise CheckpointError(f"{saved}: {which}, or begin anew with --restart")
+    if finished:
+        raise CheckpointError(
+            f"{out / METRICS}: the folder has results; name another one, or replace them with --restart"
+        )
     return None

@@ -8,6 +8,7 @@ from recon.fit.descent import minimise
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
+from recon.report.forecast import Bar, Forecast
 from recon.run.checkpoint import Checkpoint, save, save_if_possible
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
@@ -31,10 +32,10 @@ def descend_recorded(
     step: Step | None = None if start is None else start.step
     rows = [] if start is None else start.rows
     announced = 0 if step is None else len(step.plans)
-    steps = minimise(problem, step)
+    steps, before = minimise(problem, step), 0.0 if step is None else step.seconds
     with (
         open_log(out / LOG, rows) as log,
-        tqdm(total=problem.steps, initial=len(rows), unit="step") as bar,
+        Bar(Forecast(problem), problem.steps, len(rows)) as bar,
         signals_kept() as check_signals,
     ):
         try:
@@ -43,8 +44,8 @@ def descend_recorded(
                 for record in step.plans[announced:]:
                     tqdm.write(announce_record(record))
                 announced = len(step.plans)
-                bar.set_postfix(misfit=f"{step.misfit:.4g}", refresh=False)
-                bar.update()
+                bar.step(step.number, step.seconds - before, step.misfit)
+                before = step.seconds
                 if step.number % checkpoint_every == 0:
                     save_if_possible(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
                 check_signals()

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.config.conversion import dump
+from recon.config.resolved import leave_resolved
 from recon.config.schema import Config
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
@@ -26,9 +26,11 @@ from recon.run.checkpoint import Checkpoint, UnsavedWarning
 from torchdic import Grid
 from torchdic.errors import StackError
 from torchdic.files.stack import write_stack, write_volume
-from torchdic.files.whole import WriteError, write_json, write_text
+from torchdic.files.whole import WriteError, write_json
 
 VOLUME, METRICS = "volume.ome.tif", "metrics.json"
+# Every plane of every prism: as it was measured, brought to the model's unit, and as the model has it.
+IMAGES = "images.ome.tif"
 # The volume of a descent that was interrupted, beside the results of one that wasn't.
 INTERRUPTED = "volume.interrupted.ome.tif"
 
@@ -125,13 +127,11 @@ def write_results(
     found["verdict"] = verdict.as_json()
     tell(verdict)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
-    comments = "".join(f"# {note}\n" for note in notes)
     prisms = config.acquisition.prisms
 
     def write_sections() -> None:
         if sections is not None:
-            steps = [abs(b - a) for a, b in pairwise(measured.focus)]
-            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], steps[0] if steps else None)
+            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], _focus_step(measured))
 
     def draw_images() -> None:
         figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)
@@ -145,8 +145,9 @@ def write_results(
         (
             lambda: _write_volume(out / VOLUME, delta, grid),
             lambda: write_json(out / METRICS, found),
-            lambda: write_text(out / "config.resolved.toml", comments + dump(config)),
+            lambda: leave_resolved(config, out, *notes),
             write_sections,
+            lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
             draw_images,
             lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
             draw_misfit,
@@ -165,6 +166,23 @@ def leave_interrupted(out: Path, problem: Problem, step: Step) -> Path:
     delta = problem.setup.within_field(step.delta).detach().cpu()
     _write_volume(path, delta, problem.setup.field, f"delta n, interrupted after step {step.number}")
     return path
+
+
+def _write_images(
+    path: Path,
+    data: Float[Tensor, "prism focus y x"],
+    images: Float[Tensor, "prism focus y x"],
+    measured: Measured,
+) -> None:
+    """Write the measured images beside the model's, two channels for each prism. Raises StackError."""
+    names = [f"{kind}, prism {prism}" for prism in range(len(data)) for kind in ("measured", "modelled")]
+    pairs = torch.stack([data, images], 1).flatten(0, 1)
+    write_stack(path, pairs, measured.pixel_size, _focus_step(measured), names=names)
+
+
+def _focus_step(measured: Measured) -> float | None:
+    """The distance in µm between the first two focus planes; None of a single one."""
+    return next((abs(b - a) for a, b in pairwise(measured.focus)), None)
 
 
 def _write_volume(path: Path, delta: Float[Tensor, "z y x"], grid: Grid, name: str = "delta n") -> None:

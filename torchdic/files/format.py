@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from torchdic.errors import StackError
+from torchdic.files.described.setup import StatedSetup
 from torchdic.files.full_scale import full_scale
 
 
@@ -66,6 +67,7 @@ class Format:
     dtypes: the names of the dtypes that `write` can store.
     read_series: as `read`, with the number of a series, counted from 0, of which a file may hold several; None for a
         format whose files hold one.
+    setup: what such a file says of its microscope; None for a format that says nothing.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Format:
     write: Callable[[Path, Stack, str | None], None] | None = None
     dtypes: tuple[str, ...] = ()
     read_series: Callable[[Path, int], Stack] | None = None
+    setup: Callable[[Path], StatedSetup] | None = None
 
 
 def shape_text(shape: Sequence[int]) -> str:

@@ -16,12 +16,15 @@ from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Format, Stack, shape_text
+from torchdic.files.png import PNG
 from torchdic.files.tiff import TIFF
+from torchdic.files.vendors.nikon import ND2
+from torchdic.files.vendors.zeiss import CZI
 from torchdic.files.whole import WriteError, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
-FORMATS: list[Format] = [TIFF]
+FORMATS: list[Format] = [TIFF, PNG, ND2, CZI]
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
@@ -69,6 +72,7 @@ def write_stack(
     focus_step: float | None = None,
     *,
     names: Sequence[str] = (),
+    bits: int | None = None,
     compression: Literal["zlib", "lzw"] | None = None,
 ) -> None:
     """Write a stack, as OME-TIFF unless the suffix of `path` names another format. An error leaves no half a file.
@@ -78,6 +82,7 @@ def write_stack(
     pixel_size: (y, x) in µm; None where it is unknown.
     focus_step: distance between planes in µm; None where it is unknown or not the same for all planes.
     names: one per prism, or none.
+    bits: of the camera, where they are fewer than those of the dtype.
     compression: None stores the pixels as they are.
 
     Raises StackError for other shapes, a dtype that the format does not have, pixels that are not finite, sizes
@@ -92,7 +97,7 @@ def write_stack(
     array = array.reshape((1,) * (4 - array.ndim) + array.shape)
     if names and len(names) != len(array):
         raise StackError(f"{path}: {len(names)} names for {len(array)} prisms; each prism has one name")
-    _write(path, Stack(array, pixel_size, focus_step, names=tuple(names), source=str(path)), compression)
+    _write(path, Stack(array, pixel_size, focus_step, bits, tuple(names), str(path)), compression)
 
 
 def read_volume(path: str | os.PathLike[str]) -> tuple[Float[Tensor, "z y x"], Grid]:

@@ -16,6 +16,7 @@ from torchdic.files.arrangement.series import chosen_series, pages_one_by_one
 from torchdic.files.described import ome
 from torchdic.files.described.bits import stated_bits
 from torchdic.files.described.imagej import StraightLine, calibration, imagej_sizes
+from torchdic.files.described.setup import setup_in_tiff
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.full_scale import full_scale
 from torchdic.files.tiff_structure import check_pages, check_pixels
@@ -148,6 +149,8 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
     for axis, length in zip("ZYX", (stack.focus_step, dy, dx), strict=True):
         if length is not None:
             metadata |= {f"PhysicalSize{axis}": float(length), f"PhysicalSize{axis}Unit": "µm"}
+    if stack.bits is not None:
+        metadata["SignificantBits"] = stack.bits
     if stack.names:
         metadata["Channel"] = {"Name": list(stack.names)}
     resolution = {}
@@ -182,4 +185,6 @@ def _tifffile_logs_as_debug() -> Iterator[None]:
         theirs.removeFilter(divert)
 
 
-TIFF = Format("TIFF", (".tif", ".tiff", ".tf2", ".tf8", ".btf"), _read, _write, _OME_DTYPES, read_series=_read_series)
+TIFF = Format(
+    "TIFF", (".tif", ".tiff", ".tf2", ".tf8", ".btf"), _read, _write, _OME_DTYPES, _read_series, setup_in_tiff
+)

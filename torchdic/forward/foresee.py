@@ -34,6 +34,8 @@ CACHED = 32 << 20
 AMPLE = 2048
 # The map of an object aberration serves all sources: it holds less than this many times AMPLE for each pixel and slice.
 MAP = 40
+# From so many sources on, a condenser's inner ring has as many as a sample takes: any number of them holds alike.
+ALIKE = 8
 # Number of kinds of scenes whose measurements are kept.
 KEPT = 32
 _measured: "OrderedDict[Hashable, Sample]" = OrderedDict()
@@ -98,7 +100,7 @@ def allot_fields(passage: FieldPassage) -> Batches:
 
     def make() -> Sample:
         run, scale = field_sample(passage)
-        return Sample(run, sources, scale, apart=passage.transmission.ndim == 3)
+        return Sample(run, scale, apart=passage.transmission.ndim == 3)
 
     key = signature(parts), replace(fidelity, memory=1)
     room = _Room(key, make, sources, passage.transmission.device, is_learned(parts), small_batches=False)
@@ -168,7 +170,7 @@ class _Room:
                 if len(_measured) > KEPT:
                     _measured.popitem(last=False)
             _measured.move_to_end(kind)
-            return _measured[kind].peak(batches)
+            return _measured[kind].peak(self.sources, batches)
 
 
 def _demand(
@@ -199,13 +201,15 @@ def _room_for(
     wanted = learned or volume.delta.requires_grad
     # the budget plays a part in the map of an object aberration, whose steps are computed again or not
     plain = fidelity if fidelity.object_aberration is not None else replace(fidelity, memory=1)
+    # a sample has the first few of the condenser's sources, which lie on its inner ring
+    plain = replace(plain, sources=min(fidelity.sources, ALIKE))
     filled = _filled(volume) if propagation.holds_by_content else None
     parts = volume.delta.dtype, volume.absorption, volume.background, microscope, acquisition
     sources = len(microscope.sources(fidelity.sources)[1])
 
     def make() -> Sample:
         sample = VolumeSample(volume, microscope, acquisition, fidelity, levels, learned=wanted)
-        return Sample(sample.run, sources, sample.scale)
+        return Sample(sample.run, sample.scale)
 
     kind = volume.grid, signature(parts), wanted, plain, levels, filled
     gradient = torch.is_grad_enabled() and (wanted or is_learned(parts))

@@ -34,19 +34,19 @@ Run = Callable[[int, Batches], None]
 class Sample:
     """A scene's sample, and what it was found to hold.
 
-    run: computes the sample. sources: of the scene. scale: pixels of the scene to one of the sample.
+    run: computes the sample. scale: pixels of the scene to one of the sample.
     apart: whether every source has a field of its own, which is held beside the batches.
     """
 
-    def __init__(self, run: Run, sources: int, scale: float, *, apart: bool = False) -> None:
-        self._run, self._sources, self._scale, self._apart = run, sources, scale, apart
+    def __init__(self, run: Run, scale: float, *, apart: bool = False) -> None:
+        self._run, self._scale, self._apart = run, scale, apart
         self._graph = torch.is_grad_enabled()
         self._most: dict[tuple[int, Batches], int] = {}
         self._growth: dict[tuple[bool, bool], Growth] = {}
 
-    def peak(self, batches: Batches) -> int:
-        """The most bytes that the scene holds at once."""
-        count, slabs, several = batches.sources, batches.slabs, batches.sources < self._sources
+    def peak(self, sources: int, batches: Batches) -> int:
+        """The most bytes that the scene holds at once, lit by so many sources."""
+        count, slabs, several = batches.sources, batches.slabs, batches.sources < sources
         if count == 1:
             held = self._most_of(1 + several, batches)
         else:
@@ -56,8 +56,8 @@ class Sample:
             held = self._growth[slabs, several].at(count)
         if self._apart and several:
             # two single sources, and three: the third one's field is held beside them
-            pair, three = (self._most_of(sources, Batches(1)) for sources in (2, 3))
-            held += (three - pair) * (self._sources - 2 * count)
+            pair, three = (self._most_of(few, Batches(1)) for few in (2, 3))
+            held += (three - pair) * (sources - 2 * count)
         return math.ceil(self._scale * held)
 
     def _most_of(self, sources: int, batches: Batches) -> int:

@@ -117,10 +117,11 @@ def check_wrap_around(
     kept = light[order].cumsum(0) > UNREMARKED * total
     padding = math.ceil(float(beyond[order][kept].amax()))
     fate = "is cut" if cut else "comes back in at the opposite side"
+    advice = "" if cut else ", and band_limit = true would cut it"
     warnings.warn(
         WrapAroundWarning(
             f"focus {farthest:g} µm lies {distance:g} µm from the specimen: {100 * part:.2g} % of the light "
-            f"leaves the array and {fate}; {padding} more voxels of padding would hold it",
+            f"leaves the array and {fate}; {padding} more voxels of padding would hold it{advice}",
             severity=part,
         ),
         stacklevel=3,  # the caller: torch.no_grad adds a call between

@@ -45,7 +45,7 @@ class Plan:
     """The cheapest fidelity that meets a tolerance, and what to expect of it.
 
     fidelity: what to call `torchdic.image` with.
-    effects: what each effect of the scene is worth, in the order of the table.
+    effects: what each effect of the scene is worth, in the order of the table; empty where nobody asked.
     error: of the images, predicted; see `torchdic.planning.image_error`.
     seconds: predicted, of one image without its gradient.
     tolerance: the largest error that was asked for.
@@ -97,7 +97,9 @@ def describe(fidelity: Fidelity) -> str:
 
 
 @torch.no_grad()
-def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float) -> Plan:
+def plan(
+    volume: Volume, microscope: Microscope, acquisition: Acquisition, tolerance: float, *, with_effects: bool = True
+) -> Plan:
     """Find the cheapest Fidelity whose images err by at most `tolerance`, and what each effect is worth.
 
     volume: the specimen.
@@ -105,6 +107,7 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     acquisition: the prism settings and focus planes (µm) that are recorded.
     tolerance: the largest error of an image, as a part of its contrast, above 0: 0.05 is 5 % of the image's standard
         deviation; see `torchdic.planning.image_error`.
+    with_effects: whether to find what each effect is worth; the fidelity is the same without, and found sooner.
 
     Images are compared with the wave's converged ones on the same voxels: what is lost where voxels are too coarse for
     the specimen doesn't count. Where the specimen stays clear of the volume's sides, the truth is the specimen alone in
@@ -123,14 +126,15 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     with warnings.catch_warnings():
         for about_pilots in (ApertureWarning, SamplingWarning, SlabWarning, WrapAroundWarning):
             warnings.simplefilter("ignore", about_pilots)
-        chosen = _plan(scene, float(tolerance))
+        chosen = _plan(scene, float(tolerance), with_effects)
     chosen = replace(chosen, planning=time.perf_counter() - started)
     if not chosen.met:
-        worst = max(chosen.effects, key=lambda e: e.error)
+        worst = max(chosen.effects, key=lambda e: e.error, default=None)
+        matters = "" if worst is None else f"; {worst.name} matters most"
         warnings.warn(
             f"no fidelity tried is sure to meet the tolerance {tolerance:g}, which takes a predicted error of "
             f"{PILOT_SHARE * tolerance:.2g}: the best errs by about {chosen.error:.2g} "
-            f"({describe(chosen.fidelity)}; {worst.name} matters most); ask for "
+            f"({describe(chosen.fidelity)}{matters}); ask for "
             f"{_two_digits_up(chosen.error / PILOT_SHARE)}, or take finer voxels, a narrower condenser or wider sides",
             ToleranceWarning,
             stacklevel=3,
@@ -138,7 +142,7 @@ def plan(volume: Volume, microscope: Microscope, acquisition: Acquisition, toler
     return chosen
 
 
-def _plan(scene: Scene, tolerance: float) -> Plan:
+def _plan(scene: Scene, tolerance: float, with_effects: bool) -> Plan:
     """A scene's plan; slabs that don't carry the light are made finer until they do."""
     pilot = scene.hardest().window()
     slabs = pilot.coarse()
@@ -147,7 +151,7 @@ def _plan(scene: Scene, tolerance: float) -> Plan:
         try:
             climbed = climb(scene, pilot, coarse, tolerance)
             fidelity, error = _cheapest(scene, pilot, climbed, tolerance)
-            worth = effects(PlannedScene(scene, climbed, fidelity, tolerance))
+            worth = effects(PlannedScene(scene, climbed, fidelity, tolerance)) if with_effects else ()
             break
         except UnstableError:
             finer = next(slabs, None)

@@ -197,14 +197,19 @@ class _Descent:
 
         They turn where a step's images are computed otherwise than those of the step before.
         """
+        fidelity = self.problem.fidelity
 
-        def of(step: int, careful: Fidelity) -> tuple[Fidelity, Fidelity | None]:
-            coarse, fine = drafts(careful, self.problem.fidelity.draft_sources)
-            return (coarse, None) if step < COARSE_STEPS else (fine, careful if careful != fine else None)
+        def of(step: int) -> tuple[Fidelity, Fidelity | None]:
+            coarse = step < COARSE_STEPS
+            careful = fidelity.coarse if coarse else fidelity.last(self.plans)
+            first, fine = drafts(careful, fidelity.draft_sources)
+            return (first, None) if coarse else (fine, careful if careful != fine else None)
 
-        before = None if place is None else of(number - 1, self.problem.fidelity.last(self.plans))
-        careful, self.plans = self.problem.fidelity.careful(number, self.placed(place), self.plans)
-        draft, exact = of(number, careful)
+        before = None if place is None else of(number - 1)
+        # however few steps there are, the fidelity that judges the volume is there in the end
+        if number >= min(COARSE_STEPS, self.problem.steps - 1):
+            _, self.plans = fidelity.careful(number, self.placed(place), self.plans)
+        draft, exact = of(number)
         return draft, exact, before is not None and before != (draft, exact)
 
     # --- what the model says of a place -------------------------------------------------------------------------------

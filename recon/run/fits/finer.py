@@ -12,7 +12,7 @@ from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
 
 
 @runtime_checkable
-class KnownSpecimen(Protocol):
+class Phantom(Protocol):
     """A specimen whose Δn is known everywhere."""
 
     @property
@@ -45,14 +45,14 @@ class FinerModel:
         (kz, ky, kx) = self.parts
         return Grid((kz * shape[0], ky * shape[1], kx * shape[2]), (spacing[0] / kz, spacing[1] / ky, spacing[2] / kx))
 
-    def truth(self, specimen: KnownSpecimen, grid: Grid) -> Float[Tensor, "z y x"]:
+    def truth(self, specimen: Phantom, grid: Grid) -> Float[Tensor, "z y x"]:
         """Δn on a reconstruction's grid, float32: the mean of the finer voxels in each."""
         (kz, ky, kx), (nz, ny, nx) = self.parts, grid.shape
         return specimen.delta(self.grid(grid)).reshape(nz, kz, ny, ky, nx, kx).mean((1, 3, 5)).float()
 
     @torch.no_grad()
     def images(
-        self, specimen: KnownSpecimen, grid: Grid, microscope: Microscope, acquisition: Acquisition
+        self, specimen: Phantom, grid: Grid, microscope: Microscope, acquisition: Acquisition
     ) -> Float[Tensor, "prism focus y x"]:
         """The noiseless images on the pixels of a reconstruction's grid, float32.
 

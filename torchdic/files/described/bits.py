@@ -18,7 +18,7 @@ _MICRO_MANAGER = 51123  # the tag that holds the metadata of a page
 def stated_bits(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[int]:
     """All bit depths that the file states, smallest first, below that of the pixels themselves, which tells nothing."""
     found = [page.bitspersample] if isinstance(page.bitspersample, int) else []
-    for text in _texts(tif, page):
+    for text in texts(tif, page):
         found += [int(bits) for bits in _STATED.findall(text)]
     for name in _LARGEST:
         largest = page.tags.valueof(name)
@@ -28,7 +28,8 @@ def stated_bits(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[int]:
     return sorted({bits for bits in found if 0 < bits < size})
 
 
-def _texts(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[str]:
+def texts(tif: tifffile.TiffFile, page: tifffile.TiffPage) -> list[str]:
+    """What programs wrote about the file and one of its pages: descriptions, ImageJ's Info, Micro-Manager's tags."""
     first = tif.pages.first
     values = [page.description, first.description, (tif.imagej_metadata or {}).get("Info")]
     values += [part.tags.valueof(_MICRO_MANAGER) for part in (page, first)]

@@ -1,0 +1,85 @@
+"""A configuration file in TOML whose lines say where their values come from."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Origin = Literal["given", "file", "measured", "assumed"]
+
+
+@dataclass(frozen=True)
+class Sourced:
+    """A value and where it comes from.
+
+    value: as TOML holds it. origin: the user gave it, a file says it, the images show it, or nobody knows it.
+    why: more of it in some words; "" is no more. name: in plain words, by which a value that is assumed is listed.
+    """
+
+    value: Any
+    origin: Origin
+    why: str = ""
+    name: str = ""
+
+    @property
+    def comment(self) -> str:
+        """The origin, and why."""
+        return f"{self.origin}: {self.why}" if self.why else self.origin
+
+
+@dataclass(frozen=True)
+class Line:
+    """A key, its value, and a comment; "" is none. A value that is a tuple of lines is an array, an element a line."""
+
+    key: str
+    value: Any
+    comment: str = ""
+
+
+def commented(head: Sequence[str], top: Sequence[Line], tables: Mapping[str, Sequence[Line]]) -> str:
+    """A TOML text.
+
+    head: lines of comment at its beginning. top: keys before the first table. tables: the lines of each table.
+    """
+    lines = [f"# {line}".rstrip() for line in head]
+    if top:
+        lines += ["", *_lines(top)]
+    for name, below in tables.items():
+        lines += ["", f"[{name}]", *_lines(below)]
+    return "\n".join(lines) + "\n"
+
+
+def inline(value: Any) -> str:
+    """A value of TOML in one line. Raises TypeError for what TOML can't hold."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case int():
+            return str(value)
+        case float() if math.isfinite(value):
+            text = f"{value:.6g}"
+            return text if any(sign in text for sign in ".e") else f"{text}.0"
+        case list() | tuple():
+            return f"[{', '.join(map(inline, value))}]"
+        case dict():
+            return f"{{ {', '.join(f'{key} = {inline(below)}' for key, below in value.items())} }}"
+    raise TypeError(f"{value!r} is no value of TOML")
+
+
+def _lines(below: Sequence[Line]) -> list[str]:
+    written = []
+    for line in below:
+        if isinstance(line.value, tuple) and line.value and isinstance(line.value[0], Line):
+            written.append(_with(f"{line.key} = [", line.comment))
+            written += [_with(f"    {inline(each.value)},", each.comment) for each in line.value]
+            written.append("]")
+        else:
+            written.append(_with(f"{line.key} = {inline(line.value)}", line.comment))
+    return written
+
+
+def _with(text: str, comment: str) -> str:
+    return f"{text:<40} # {comment}" if comment else text

@@ -1,0 +1,121 @@
+"""How long a descent will take: foreseen before its first step, and followed as its steps are taken."""
+
+import warnings
+from collections.abc import MutableMapping
+from statistics import mean
+from typing import Any
+
+from tqdm import tqdm
+
+from recon.fit.newton.correction import drafts
+from recon.fit.newton.descent import COARSE_STEPS
+from recon.fit.planned import GivenFidelity
+from recon.fit.problem import Problem
+from torchdic import Acquisition, Fidelity, Microscope, Volume
+from torchdic.instrument.microscope import limited
+from torchdic.planning.cost import directions, seconds, work
+from torchdic.scalar import number
+
+# What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
+# direction; the weak specimen's Hessian of some directions, in images of them; how often the correction is renewed.
+WITH_GRADIENT, MODEL, HESSIAN, RENEWED = 2.75, 100.0, 15.0, 1 / 3
+# Steps whose seconds are averaged.
+LAST = 3
+
+
+class Forecast:
+    """The seconds that are left of a descent.
+
+    A step's cost is known in images, and its seconds from the steps of its kind that have been taken; before there are
+    any, from those of another kind, or from a part of an image that is timed.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        self._costs = [_cost(problem, number) for number in range(problem.steps)]
+        self._taken: list[tuple[float, float]] = []
+
+    def cost(self, number: int) -> float:
+        """What a step costs, in the work of its images. number: counted from 0."""
+        return self._costs[number]
+
+    def taken(self, number: int, spent: float) -> None:
+        """Note the seconds that a step took; number: counted from 1."""
+        self._taken.append((self._costs[number - 1], spent))
+
+    def left(self, number: int) -> float | None:
+        """The seconds that the steps after one will take, if all are taken. number: steps so far. None is unknown."""
+        rate = self._rate() if number < len(self._costs) else 0.0
+        if rate is None:
+            return None
+        known = {cost: mean([s for c, s in self._taken if c == cost][-LAST:]) for cost, _ in self._taken}
+        return sum(known.get(cost, rate * cost) for cost in self._costs[number:])
+
+    def _rate(self) -> float | None:
+        """Seconds for each unit of cost."""
+        if self._taken:
+            costs, spent = (sum(column) for column in zip(*self._taken[-LAST:], strict=True))
+            return spent / costs
+        fidelity = _careful(self._problem)
+        if fidelity is None:
+            return None
+        scene = _scene(self._problem)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the descent's own images will warn
+            return seconds(*scene, fidelity) / work(fidelity, *scene)
+
+
+def _scene(problem: Problem) -> tuple[Volume, Microscope, Acquisition]:
+    """What the images of a problem are made of, lit by the light that enters the medium."""
+    setup = problem.setup
+    volume = setup.volume
+    return volume, limited(setup.microscope, number(volume.background), volume.delta.dtype), setup.acquisition
+
+
+def _careful(problem: Problem) -> Fidelity | None:
+    """The fidelity of the last steps; None where it has yet to be planned."""
+    return problem.fidelity.fidelity if isinstance(problem.fidelity, GivenFidelity) else None
+
+
+def _cost(problem: Problem, number: int) -> float:
+    """What a step costs, in the work of its images; number: counted from 0."""
+    setup, scene = problem.setup, _scene(problem)
+    careful = _careful(problem)
+    if problem.method == "adam":
+        if careful is None:
+            return 1.0
+        fidelity, _ = problem.fidelity.at(number, problem.steps, setup, ())
+        return WITH_GRADIENT * work(fidelity, *scene)
+    careful = careful or problem.fidelity.coarse
+    coarse, fine = drafts(careful, problem.fidelity.draft_sources)
+    draft = coarse if number < COARSE_STEPS else fine
+    each = work(draft, *scene)
+    cost = WITH_GRADIENT * each + MODEL * each / directions(scene[1], draft.sources)
+    if number in (0, COARSE_STEPS):
+        cost += HESSIAN * each
+    if number >= COARSE_STEPS and fine != careful:
+        cost += work(careful, *scene) * (1 if number == COARSE_STEPS else RENEWED)
+    return cost
+
+
+class Bar(tqdm):
+    """A progress bar over a descent's steps, whose time left is the forecast's."""
+
+    def __init__(self, forecast: Forecast, total: int, initial: int) -> None:
+        self._forecast = forecast
+        self._left: float | None = forecast.left(initial)
+        form = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}, {left}{postfix}]"
+        super().__init__(total=total, initial=initial, bar_format=form)
+
+    def step(self, number: int, spent: float, misfit: float) -> None:
+        """Show a step. number: counted from 1. spent: seconds that it took. misfit: before it."""
+        self._forecast.taken(number, spent)
+        self._left = self._forecast.left(number)
+        self.set_postfix(misfit=f"{misfit:.4g}", refresh=False)
+        self.update()
+
+    @property
+    def format_dict(self) -> MutableMapping[str, Any]:
+        """What the bar shows."""
+        left = "time unknown" if self._left is None else f"{self.format_interval(self._left)} left"
+        return {**super().format_dict, "left": left}

@@ -1,0 +1,71 @@
+"""The time left of a descent: known kinds of steps by their own seconds, others by what they cost."""
+
+import math
+
+import pytest
+import torch
+
+from recon.fit.newton.descent import COARSE_STEPS
+from recon.fit.problem import Problem, Recipe
+from recon.fit.setup import Setup, empty_medium
+from recon.report.forecast import Bar, Forecast
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+
+GRID = Grid((4, 12, 10), (0.5, 0.25, 0.25))
+ACQUISITION = Acquisition([Prism((0.0, 0.2), 1.2)], [-1.0, 1.0])
+
+
+def problem(fidelity=None, **recipe):
+    data = 0.3 + 0.1 * torch.rand(1, 2, 12, 10, generator=torch.Generator().manual_seed(0))
+    medium = empty_medium(GRID, 1.5, data)
+    setup = Setup(medium, Microscope(0.546, Objective(0.6), Condenser(0.4)), ACQUISITION)
+    return Problem.from_recipe(data, setup, fidelity or Fidelity(sources=128, padding=4), Recipe(**recipe))
+
+
+@pytest.mark.parametrize("method", ["newton", "adam"])
+@pytest.mark.parametrize("fidelity", [None, 0.1])
+def test_the_time_before_the_first_step_is_that_of_all_steps(method, fidelity):
+    forecast = Forecast(problem(fidelity, method=method))
+    left = forecast.left(0)
+    if fidelity is not None:
+        assert left is None  # the fidelity has yet to be planned
+    else:
+        assert 0 < left < math.inf
+
+
+def test_steps_that_cost_what_was_foreseen_leave_what_was_foreseen():
+    made = problem(steps=12)
+    forecast = Forecast(made)
+    costs = [forecast.cost(number) for number in range(12)]
+    for number, cost in enumerate(costs[:-1], 1):
+        forecast.taken(number, 0.01 * cost)
+        assert forecast.left(number) == pytest.approx(0.01 * sum(costs[number:]))
+    assert forecast.left(12) == 0
+
+
+def test_careful_steps_are_known_to_take_longer_before_the_first_of_them():
+    forecast = Forecast(problem(steps=20))
+    forecast.taken(1, 2.0)
+    forecast.taken(2, 1.0)
+    assert forecast.left(2) > 20 - 2
+    coarse, fine = forecast.cost(1), forecast.cost(COARSE_STEPS + 1)
+    assert fine > coarse
+
+
+def test_a_kind_of_step_that_was_seen_is_known_by_its_own_seconds():
+    forecast = Forecast(problem(method="adam", steps=10, draft_sources=8))
+    for number in range(1, 9):  # the last four steps take all directions, here no longer than the others
+        forecast.taken(number, 1.0)
+    assert forecast.left(8) == pytest.approx(2.0)
+
+
+def test_the_bar_says_what_is_left(capsys):
+    with Bar(Forecast(problem(steps=12)), 12, 0) as bar:
+        bar.step(1, 60.0, 0.5)
+        bar.refresh()
+    said = capsys.readouterr().err
+    assert "1/12 steps" in said
+    assert " left, misfit=0.5" in said
+    with Bar(Forecast(problem(0.1, steps=12)), 12, 0) as bar:
+        bar.refresh()
+    assert "time unknown" in capsys.readouterr().err

@@ -1,0 +1,231 @@
+"""A stack in several files, and what files say of their microscope."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import tifffile
+
+from torchdic.errors import StackError
+from torchdic.files.described.setup import setup_in_words
+from torchdic.files.gathered import gather
+from torchdic.files.stack import read_stack, write_stack
+
+STACK = np.arange(2 * 12 * 5 * 6, dtype=np.uint16).reshape(2, 12, 5, 6) + 7
+
+
+def planes(folder, name, data=STACK):
+    """A file for each plane; name: of the file, from the setting and the plane."""
+    folder.mkdir(exist_ok=True)
+    for setting, images in enumerate(data):
+        for plane, image in enumerate(images):
+            tifffile.imwrite(folder / name(setting, plane), image, photometric="minisblack", metadata=None)
+    return folder
+
+
+# --- several files ----------------------------------------------------------------------------------------------------
+
+NAMES = {
+    "c and z": lambda s, p: f"img_c{s}_z{p}.tif",
+    "z before channel": lambda s, p: f"z{p}ch{s}.tif",
+    "words": lambda s, p: f"{('minus', 'plus')[s]}_{p + 1}.tif",
+    "micro-manager": lambda s, p: f"img_channel{s:03}_position000_time000000000_z{p:03}.tif",
+    "w of MetaMorph": lambda s, p: f"cell_w{s + 1}_t{p}.tif",
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_settings_and_planes_are_found_in_the_names(tmp_path, name):
+    gathered = gather([planes(tmp_path / "planes", NAMES[name])])
+    assert np.array_equal(gathered.stack.data, STACK)
+    assert len(gathered.files) == 24
+
+
+def test_planes_come_in_the_natural_order_of_their_names(tmp_path):
+    """Plane 2 before plane 10, in a folder or typed in any order."""
+    folder = planes(tmp_path / "planes", lambda _, p: f"plane {p}.tif", STACK[:1])
+    assert np.array_equal(gather([folder]).stack.data, STACK[:1])
+    assert np.array_equal(gather(sorted(folder.iterdir(), reverse=True)).stack.data, STACK[:1])
+
+
+def test_files_of_several_planes_are_a_setting_each(tmp_path):
+    for setting, images in enumerate(STACK):
+        write_stack(tmp_path / f"bias{setting}.ome.tif", images, (0.1, 0.1), 0.5)
+    stack = gather(list(tmp_path.iterdir())).stack
+    assert np.array_equal(stack.data, STACK)
+    assert (stack.pixel_size, stack.focus_step) == ((0.1, 0.1), 0.5)
+
+
+def test_one_file_is_read_as_it_is(tmp_path):
+    write_stack(tmp_path / "one.ome.tif", STACK, (0.1, 0.1), 0.5, bits=12)
+    gathered = gather([tmp_path / "one.ome.tif"])
+    assert gathered.one_file
+    assert np.array_equal(gathered.stack.data, STACK)
+    assert gathered.stack.bits == read_stack(tmp_path / "one.ome.tif").bits == 12
+    assert np.array_equal(gather([tmp_path]).stack.data, STACK)  # a folder that holds it alone
+
+
+def test_micro_managers_metadata_give_sizes_and_bits(tmp_path):
+    folder = planes(tmp_path / "planes", NAMES["micro-manager"])
+    (folder / "metadata.txt").write_text(
+        '{"Summary": {"PixelSize_um": 0.108, "z-step_um": 0.25, "BitDepth": 12}, "Objective-Label": "63x/1.40 Oil"}'
+    )
+    gathered = gather([folder])
+    stack, setup = gathered.stack, gathered.setup
+    assert (stack.pixel_size, stack.focus_step, stack.bits) == ((0.108, 0.108), 0.25, 12)
+    assert (setup.na, setup.immersion) == (1.4, 1.515)
+
+
+def test_what_is_no_stack_of_files_is_refused_in_a_line(tmp_path):
+    empty, twice, odd = tmp_path / "empty", tmp_path / "twice", tmp_path / "odd"
+    empty.mkdir()
+    (empty / "notes.txt").write_text("no image")
+    planes(twice, lambda s, p: f"a{s}b{p}.tif")
+    planes(odd, lambda _, p: f"plane{p}.tif", STACK[:1])
+    tifffile.imwrite(odd / "plane3.tif", STACK[0, 0, :4])
+    (odd / "plane4.tif").unlink()
+    for paths, words in (
+        ([empty], r"empty: holds no images \(\.tif, "),
+        ([], "no stack is named"),
+        ([odd, twice], "is a folder; give one folder, or files"),
+        ([odd], r"plane3\.tif: holds 1 × 1 × 4 × 6 uint16, plane0\.tif 1 × 1 × 5 × 6"),
+        ([twice], r"2 parts of the names change \(a0b0\.tif, a1b11\.tif\): name prism settings channel1"),
+        ([tmp_path / "none.tif"], "no such file"),
+    ):
+        with pytest.raises(StackError, match=words) as caught:
+            gather(paths)
+        assert "\n" not in str(caught.value)
+    (twice / "z5.tif").touch()
+    planes(tmp_path / "gap", NAMES["c and z"])
+    (tmp_path / "gap" / "img_c1_z3.tif").unlink()
+    with pytest.raises(StackError, match="23 files are not 2 settings × 12 planes"):
+        gather([tmp_path / "gap"])
+
+
+# --- what files say ---------------------------------------------------------------------------------------------------
+
+WORDS = {
+    "Information|Instrument|Objective|LensNA #1 = 0.75\nImmersion #1 = Air": (0.75, 1.0),
+    "ObjectiveLabel: Plan-Apochromat 63x/1.40 Oil DIC": (1.4, 1.515),
+    "Nikon Plan Apo 60x NA 1.2 Water": (1.2, 1.333),
+    '"NumericalAperture": 0.95, "Immersion": "Dry"': (0.95, 1.0),
+    "63x/1,4 Oil": (1.4, 1.515),
+    "Exposure=20, Gain=1.4": (None, None),
+}
+
+
+@pytest.mark.parametrize("words", WORDS)
+def test_aperture_and_immersion_are_found_in_a_programs_words(words):
+    setup = setup_in_words(words)
+    assert (setup.na, setup.immersion) == WORDS[words]
+
+
+def test_ome_says_the_objective_that_was_used(tmp_path):
+    path = tmp_path / "stack.ome.tif"
+    write_stack(path, STACK, (0.1, 0.1), 0.5)
+    with tifffile.TiffFile(path) as tif:
+        xml = str(tif.ome_metadata)
+    lenses = '<Objective ID="O:0" LensNA="0.3"/><Objective ID="O:1" LensNA="1.3" Immersion="Glycerol" Model="HC"/>'
+    xml = xml.replace("<Image ", f'<Instrument ID="I:0">{lenses}</Instrument><Image ', 1)
+    xml = xml.replace("<Pixels ", '<ObjectiveSettings ID="O:1" RefractiveIndex="1.46"/><Pixels ', 1)
+    tifffile.tiffcomment(path, xml.replace("<Channel ", '<Channel EmissionWavelength="546" ').encode())
+    setup = gather([path]).setup
+    assert (setup.na, setup.immersion, setup.objective, setup.wavelength) == (1.3, 1.46, "HC", pytest.approx(0.546))
+
+
+# --- files of makers --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class StandInND2:
+    """As the package nd2 gives a file; the package itself is no dependency of the tests."""
+
+    path: Path
+
+    def __enter__(self):
+        channel = SimpleNamespace(
+            channel=SimpleNamespace(name="DIC", emissionLambdaNm=546.0),
+            microscope=SimpleNamespace(
+                objectiveNumericalAperture=1.2, immersionRefractiveIndex=1.333, objectiveName="Plan Apo"
+            ),
+        )
+        self.sizes = {"P": 2, "Z": 12, "Y": 5, "X": 6}
+        self.metadata = SimpleNamespace(channels=[channel])
+        self.attributes = SimpleNamespace(bitsPerComponentSignificant=12)
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def asarray(self):
+        return STACK
+
+    def voxel_size(self):
+        return SimpleNamespace(x=0.11, y=0.12, z=0.3)
+
+
+CZI_METADATA = """<ImageDocument><Metadata><Scaling><Items>
+<Distance Id="X"><Value>1.1e-7</Value></Distance><Distance Id="Y"><Value>1.2e-7</Value></Distance>
+<Distance Id="Z"><Value>3e-7</Value></Distance></Items></Scaling>
+<Information><Image><ComponentBitCount>12</ComponentBitCount></Image><Instrument><Objectives>
+<Objective Name="Plan-Apo"><LensNA>1.4</LensNA><Immersion>Oil</Immersion></Objective>
+</Objectives></Instrument></Information></Metadata></ImageDocument>"""
+
+
+@dataclass
+class StandInCZI:
+    """As the package czifile gives a file."""
+
+    path: Path
+
+    def __enter__(self):
+        self.scenes = {
+            number: SimpleNamespace(dims=("Z", "Y", "X"), asarray=lambda number=number: STACK[number])
+            for number in range(2)
+        }
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def metadata(self):
+        return CZI_METADATA
+
+
+def stand_in(monkeypatch, name, **classes):
+    module = ModuleType(name)
+    vars(module).update(classes)
+    monkeypatch.setitem(sys.modules, name, module)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "name", "classes", "na"),
+    [("nd2", "nd2", {"ND2File": StandInND2}, 1.2), ("czi", "czifile", {"CziFile": StandInCZI}, 1.4)],
+)
+def test_a_makers_file_is_read_by_its_package(tmp_path, monkeypatch, suffix, name, classes, na):
+    stand_in(monkeypatch, name, **classes)
+    path = tmp_path / f"stack.{suffix}"
+    path.write_bytes(b"bytes of a maker")
+    gathered = gather([path], series=1)
+    assert np.array_equal(gathered.stack.data, STACK[1:])
+    assert gathered.stack.pixel_size == pytest.approx((0.12, 0.11))
+    assert (gathered.stack.focus_step, gathered.stack.bits) == (pytest.approx(0.3), 12)
+    assert gathered.setup.na == na
+    with pytest.raises(StackError, match="series 2 must be from 0 to 1"):
+        gather([path], series=2)
+    with pytest.raises(StackError, match=r"more dimensions|holds 2 scenes"):
+        gather([path])
+
+
+@pytest.mark.parametrize(("suffix", "name"), [("nd2", "nd2"), ("czi", "czifile")])
+def test_a_missing_package_is_named_with_how_to_install_it(tmp_path, monkeypatch, suffix, name):
+    monkeypatch.setitem(sys.modules, name, None)
+    path = tmp_path / f"stack.{suffix}"
+    path.write_bytes(b"bytes of a maker")
+    with pytest.raises(
+        StackError, match=rf"read by the package {name}, which is missing: pip install 'torchdic\[bio\]'"
+    ):
+        gather([path])

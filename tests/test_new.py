@@ -1,0 +1,322 @@
+"""torchdic new: recorded stacks of several kinds give back what was put in, and the file that is written runs."""
+
+import math
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synthetic import Ellipsoid
+from data_synthetic.recorder.drawn import drawn
+from data_synthetic.recorder.faults import Faults
+from data_synthetic.recorder.record import Finer, record
+from data_synthetic.recorder.writing import KINDS, write_recording
+from data_synthetic.scenes.any_specimen import solid
+from recon.cli import main
+from recon.cli.own_stack.settled import settle, slices_of
+from recon.config.commented import Line, commented, inline
+from recon.config.reading import load
+from recon.recording.survey.direction import ShearDirection
+from recon.recording.survey.survey import SettingSurvey, Survey
+from torchdic import Acquisition, Camera, Condenser, Grid, Microscope, Objective, Prism
+from torchdic.files.described.setup import StatedSetup
+from torchdic.files.format import Stack
+from torchdic.files.gathered import Gathered
+from torchdic.files.stack import read_stack, write_stack
+
+FIELD = Grid((6, 40, 44), (0.5, 0.15, 0.15))
+CAMERA = Camera(photons=8000.0, read_noise=2.0, gain=0.4, offset=60.0, bits=12)
+SPECIMEN = solid(Ellipsoid((0.9, 0.7, 1.3)), 0.02, 1.335)
+
+
+def recorded(biases=(1.4, -1.4), degrees=40, planes=5):
+    angle = math.radians(degrees)
+    prisms = [Prism((0.25 * math.sin(angle), 0.25 * math.cos(angle)), bias) for bias in biases]
+    focus = [0.4 * (k - (planes - 1) / 2) for k in range(planes)]
+    microscope = Microscope(0.546, Objective(0.9), Condenser(0.6), CAMERA)
+    faults = Faults(tilt=(0.1, 0.05), flicker=0.01, hot=3, dead=1, dark_current=0.5)
+    return record(SPECIMEN, FIELD, microscope, Acquisition(prisms, focus), faults, Finer((1, 1, 1), 12, 8), 3)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return recorded()
+
+
+def new(*words):
+    return main(["new", *map(str, words)])
+
+
+def written(recording, folder, kind="ome"):
+    return write_recording(recording, folder / ("planes" if "micro" in kind or "folder" in kind else "s.tif"), kind)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "pages"])
+def test_a_recording_gives_back_what_was_put_in(tmp_path, recording, kind, capsys):
+    """Sizes and apertures exactly where the file has them, else they are named as assumed; angle to 5°, signs right."""
+    stack = written(recording, tmp_path, kind)
+    assert new(stack, "--out", tmp_path / "run.toml") == 0
+    config, text = load(tmp_path / "run.toml"), (tmp_path / "run.toml").read_text()
+    first, second = config.acquisition.prisms
+    assert first is not None
+    assert second is not None
+    angle = math.degrees(math.atan2(float(first.shear[0]), float(first.shear[1])))
+    assert abs((angle - 40 + 180) % 360 - 180) < 5
+    assert second.shear == first.shear
+    assert float(first.bias) == -float(second.bias) > 0
+    assert len(config.acquisition.focus) == 5
+    assert config.volume.shape[1:] == (40, 44)
+    assert config.data is not None
+    assert np.array_equal(read_stack(config.data.path).data, recording.data)
+    sized, lens = kind in ("ome", "imagej", "micro-manager"), kind not in ("tiff", "folder")
+    assert ("pixel size" in config.assumed) == (not sized)
+    assert ("objective's NA" in config.assumed) == (not lens)
+    assert ("wavelength" in config.assumed) == (kind != "ome")
+    if sized:
+        assert config.volume.spacing[1:] == pytest.approx((0.15, 0.15), rel=1e-5)
+        assert np.allclose(np.diff(config.acquisition.focus), 0.4)
+    if lens:
+        assert config.microscope.objective is not None
+        assert config.microscope.objective.na == 0.9
+    printed = capsys.readouterr().out
+    assert "2 prism settings × 5 planes × 40 × 44 pixels" in printed
+    assert "3, 1, 0" in printed  # hot, dead, saturated pixels
+    origins = ("assumed", "measured", "file", "chosen", "given", "angle: from right")
+    assert all(any(word in line for word in origins) for line in values(text))
+
+
+def values(text):
+    """The lines of a configuration that hold a value."""
+    return [line for line in text.splitlines() if ("=" in line and not line.startswith("#"))]
+
+
+def test_what_is_written_reconstructs_as_it_is_and_warns_of_what_is_assumed(tmp_path, recording, capsys):
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml") == 0
+    text = (tmp_path / "run.toml").read_text()
+    (tmp_path / "run.toml").write_text(text.replace("[reconstruction]", "[reconstruction]\nsteps = 2"))
+    assert main(["reconstruct", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "volume.ome.tif").exists()
+    printed = capsys.readouterr()
+    assert "run.toml: assumed, not known: shear's length, bias, condenser's NA, medium's index" in printed.err
+    assert "4 stuck pixels" in printed.out
+
+
+def test_options_fill_in_what_the_file_lacks(tmp_path, recording):
+    options = {
+        "pixel-size": 0.15,
+        "z-step": 0.4,
+        "wavelength": 0.546,
+        "na": 0.9,
+        "condenser-na": 0.6,
+        "background": 1.34,
+        "shear": 0.25,
+        "bias": 80,
+    }
+    words = [word for name, value in options.items() for word in (f"--{name}", value)]
+    assert new(written(recording, tmp_path, "tiff"), "--out", tmp_path / "run.toml", *words) == 0
+    config = load(tmp_path / "run.toml")
+    assert config.assumed == ("order of the planes", "sign of Δn")
+    assert config.microscope.condenser is not None
+    assert (config.microscope.wavelength, config.microscope.condenser.na) == (0.546, 0.6)
+    assert config.volume.background == 1.34
+    (first, _), shear = config.acquisition.prisms, 0.25
+    assert first is not None
+    assert math.hypot(*map(float, first.shear)) == pytest.approx(shear)
+    assert float(first.bias) == pytest.approx(math.radians(80))
+
+
+def test_a_lower_index_turns_the_shear_and_the_bounds(tmp_path, recording):
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", "--lower") == 0
+    config = load(tmp_path / "run.toml")
+    assert "sign of Δn" not in config.assumed
+    assert (config.reconstruction.bounds.lower, config.reconstruction.bounds.upper) == (None, 0.0)
+    prism = config.acquisition.prisms[0]
+    assert prism is not None
+    assert abs(math.degrees(math.atan2(float(prism.shear[0]), float(prism.shear[1]))) - (40 - 180)) < 5
+
+
+def test_a_shear_that_is_given_reversed_is_warned_of(tmp_path, recording, capsys):
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", "--shear-angle", 220) == 0
+    assert "220° is given: reversed, unless Δn has the other sign" in capsys.readouterr().out
+    prism = load(tmp_path / "run.toml").acquisition.prisms[0]
+    assert prism is not None
+    assert math.degrees(math.atan2(float(prism.shear[0]), float(prism.shear[1]))) == pytest.approx(220 - 360)
+
+
+def test_init_is_an_alias(tmp_path, recording):
+    stack = written(recording, tmp_path)
+    assert main(["init", str(stack), "--out", str(tmp_path / "run.toml")]) == 0
+
+
+def test_several_files_are_joined_beside_the_configuration(tmp_path, recording):
+    folder = written(recording, tmp_path, "folder")
+    assert new(*folder.glob("*.tif"), "--out", tmp_path / "runs" / "run.toml", "--pixel-size", 0.15) == 0
+    joined = read_stack(tmp_path / "runs" / "run.stack.ome.tif")
+    assert np.array_equal(joined.data, recording.data)
+    assert joined.pixel_size == (0.15, 0.15)
+    assert 'path = "run.stack.ome.tif"' in (tmp_path / "runs" / "run.toml").read_text()
+
+
+def test_one_plane_has_one_slice(tmp_path):
+    stack = written(recorded((1.4,), planes=1), tmp_path)
+    assert new(stack, "--out", tmp_path / "run.toml") == 0
+    config = load(tmp_path / "run.toml")
+    assert config.volume.shape[0] == 1
+    assert "order of the planes" not in config.assumed
+
+
+def test_nothing_is_overwritten(tmp_path, recording, capsys):
+    stack = written(recording, tmp_path)
+    (tmp_path / "run.toml").write_text("mine")
+    assert new(stack, "--out", tmp_path / "run.toml") == 2
+    assert "run.toml: is there already, and isn't overwritten" in capsys.readouterr().err
+    assert (tmp_path / "run.toml").read_text() == "mine"
+
+
+REFUSALS = {
+    ("--wavelength", "546"): "546 µm is no wavelength of light (0.01 to 20 µm); lengths are in µm: 546 nm are 0.546 µm",
+    ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",
+    ("--shear", "180"): "--shear: 180 µm is no shear",
+    ("--na", "0"): "--na 0 must be above 0",
+    ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
+    ("--background", "0.9"): "--background 0.9 must be at least 1",
+    ("--bias", "nan"): "--bias nan must be",
+    ("--out", "run.txt"): "must end in .toml",
+}
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_what_cannot_be_is_one_line_and_leaves_no_file(tmp_path, recording, words, capsys):
+    out = [] if "--out" in words else ["--out", tmp_path / "run.toml"]
+    assert new(written(recording, tmp_path), *out, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert REFUSALS[words] in line
+    assert not (tmp_path / "run.toml").exists()
+
+
+def test_a_folder_of_nothing_is_one_line(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert new(tmp_path / "empty", "--out", tmp_path / "run.toml") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "empty: holds no images (.tif," in line
+
+
+def test_floats_are_scaled_by_their_background(tmp_path, recording):
+    write_stack(tmp_path / "f.tif", recording.data.astype(np.float32) / 900, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "f.tif", "--out", tmp_path / "run.toml") == 0
+    config = load(tmp_path / "run.toml")
+    assert config.data is not None
+    assert config.data.scale == "background"
+
+
+@pytest.mark.parametrize(
+    ("planes", "step", "depth", "pixel", "expected"),
+    [
+        (1, 0.5, 0.9, 0.1, (1, 0.9)),
+        (11, 0.3, 0.9, 0.1, (13, 0.3)),  # the step serves, between a quarter and half the depth of field
+        (11, 0.1, 0.9, 0.1, (5, 0.45)),  # a finer step doesn't ask for finer slices
+        (11, 1.0, 0.9, 0.1, (25, 0.45)),  # nor a coarser one for coarser slices
+        (5, 2.0, 8.0, 0.4, (16, 1.0)),  # no thicker than 1 µm
+        (11, 0.2, 0.2, 0.15, (15, 0.15)),  # no thinner than a pixel
+    ],
+)
+def test_slices_fill_the_focus_range_and_a_depth_of_field(planes, step, depth, pixel, expected):
+    number, thickness = slices_of(planes, step, depth, pixel)
+    assert (number, thickness) == (expected[0], pytest.approx(expected[1]))
+    if planes > 1:
+        assert number * thickness >= (planes - 1) * step + depth - 1e-9
+
+
+def test_commented_toml_is_toml():
+    value = {"a": 1, "b": [0.25, 3.0, True], "c": 'x "y" \\ µ'}
+    elements = (Line("", 1.5, "one"), Line("", 2.0))
+    text = commented(["head"], [Line("top", value, "why")], {"t": [Line("list", elements)]})
+    assert tomllib.loads(text) == {"top": value, "t": {"list": [1.5, 2.0]}}
+    with pytest.raises(TypeError, match="no value of TOML"):
+        inline(math.nan)
+
+
+def test_a_recording_in_few_bits_says_them(tmp_path, recording, capsys):
+    assert new(written(replace(recording), tmp_path), "--out", tmp_path / "run.toml") == 0
+    assert "12 bits" in capsys.readouterr().out
+
+
+def setting(degrees, sure=3.0, likeness=(), *, signed=True, level=1000.0):
+    """What a setting's images tell; None for degrees shows no direction."""
+    direction = None
+    if degrees is not None:
+        direction = ShearDirection(math.radians(degrees), math.radians(sure), signed, 1)
+    return SettingSurvey(level, (0.0, 0.0), 0.0, 0.0, np.ones(3), 10.0, direction, likeness)
+
+
+LAYOUTS = {
+    "one": ([setting(40)], [(40, 90)]),
+    "a pair of biases": ([setting(38), setting(222, likeness=(-0.8,))], [(40, 90), (40, -90)]),
+    "two shears across": ([setting(40), setting(130, likeness=(0.9,))], [(40, 90), (130, 90)]),
+    "two pairs": (
+        [setting(41), setting(219), setting(309), setting(131)],
+        [(40, 90), (40, -90), (310, 90), (310, -90)],
+    ),
+    "six frames: two shears with three biases": (
+        [setting(d) for d in (40, 40, 220, 130, 130, 310)],
+        [(40, 90), (40, 90), (40, -90), (130, 90), (130, 90), (130, -90)],
+    ),
+    "six frames: two shears with bias −, 0, +": (
+        [setting(d, level=1000.0 if d else 30.0) for d in (40, None, 220, 130, None, 310)],
+        [(40, 90), (40, 0), (40, -90), (130, 90), (130, 0), (130, -90)],
+    ),
+    "the first is dark": ([setting(None, level=30.0), setting(40)], [(40, 0), (40, 90)]),
+    "the second shows none": ([setting(40), setting(None, likeness=(0.2,))], [(40, 90), (40, -90)]),
+    "the second is as the first": ([setting(40), setting(None, likeness=(0.9,))], [(40, 90), (40, 90)]),
+    "the fourth shows none": (
+        [setting(40), setting(220), setting(130), setting(None, likeness=(0.1, 0.2, -0.1))],
+        [(40, 90), (40, -90), (130, 90), (130, -90)],
+    ),
+    "the first shows none": ([setting(None), setting(220, likeness=(0.2,))], [(40, 90), (40, -90)]),
+    "none shows any": ([setting(None), setting(None, likeness=(0.9,))], [(45, 90), (45, 90)]),
+    "crowded, without a sign": (
+        [setting(40, 20, signed=False), setting(44, 20, (-0.7,), signed=False)],
+        [(42, 90), (42, -90)],
+    ),
+    "the surer counts more": ([setting(40, 1.0), setting(230, 3.0)], [(41, 90), (41, -90)]),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_settings_along_one_axis_share_its_angle_and_differ_in_bias(name):
+    settings, expected = LAYOUTS[name]
+    nothing = np.zeros((4, 4), bool)
+    alike = [replace(each, likeness=each.likeness or (0.0,) * number) for number, each in enumerate(settings)]
+    stack = Stack(np.ones((len(settings), 3, 4, 4), np.uint16))
+    settled = settle(Gathered(stack, (), StatedSetup()), Survey(tuple(alike), 1, None, nothing, nothing, 0), {})
+    found = [(angle.value, bias.value) for _, angle, bias in settled.prisms]
+    assert found == [(pytest.approx(angle, abs=0.1), bias) for angle, bias in expected]
+
+
+def test_the_angle_is_as_uncertain_as_its_settings_are_apart():
+    nothing = np.zeros((4, 4), bool)
+    found = Survey((setting(30, 2), setting(230, 2, (0.0,))), 1, None, nothing, nothing, 0)
+    settled = settle(Gathered(Stack(np.ones((2, 3, 4, 4), np.uint16)), (), StatedSetup()), found, {})
+    assert settled.prisms[0][1].why.startswith("± 5°")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_drawn_recordings_give_back_their_shears_signs_and_axes(tmp_path, seed):
+    """Each specimen, file and microscope: signs right, and axes to three of their uncertainties."""
+    found = drawn(seed, finer=Finer((2, 2, 2), 16, 24))
+    told, recording = found.told, found.recording
+    named = {"na": told.na, "condenser-na": told.condenser_na, "background": told.background}
+    words = [word for name, value in named.items() for word in (f"--{name}", value)]
+    stack = write_recording(recording, tmp_path / f"s.{found.file_kind}.tif", found.file_kind)
+    out = tmp_path / "run.toml"
+    assert new(stack, "--out", out, *words, *(["--lower"] if told.lower else [])) == 0
+    sure = [float(words.split("°")[0]) for words in out.read_text().split("measured: ± ")[1:]]
+    for prism, true, uncertainty in zip(load(out).acquisition.prisms, recording.acquisition.prisms, sure, strict=False):
+        assert prism is not None
+        assert true is not None
+        (y, x), (ty, tx) = (tuple(map(float, each.shear)) for each in (prism, true))
+        sign = math.copysign(1.0, float(prism.bias)) * math.copysign(1.0, float(true.bias))
+        wrong = math.degrees(math.atan2(sign * (ty * x - tx * y), sign * (ty * y + tx * x)))
+        assert abs(wrong) < 3 * uncertainty + 0.5  # which is printed as a whole number

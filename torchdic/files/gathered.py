@@ -1,0 +1,157 @@
+"""A stack that lies in several files: a folder of planes, a file for each plane, or a file for each prism setting."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from torchdic.errors import StackError
+from torchdic.files.described.setup import StatedSetup, setup_in_words, setup_of_all
+from torchdic.files.format import Stack, shape_text
+from torchdic.files.stack import FORMATS, format_of, read_stack
+
+# Micro-Manager's file beside the planes of a folder.
+_METADATA = "metadata.txt"
+
+# Letters before a number in a file's name, by which it counts planes or prism settings.
+_OF_PLANES = ("z", "plane", "planes", "slice", "focus", "depth", "t", "time")
+_OF_PRISMS = ("c", "ch", "channel", "w", "setting", "prism", "bias", "shear", "frame")
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """A stack, the files that it comes from, and what they say of the microscope.
+
+    stack: its source names the one file, or the folder and the number of files.
+    files: in the order in which they were read. setup: what they say; sizes that the stack has are not repeated.
+    """
+
+    stack: Stack
+    files: tuple[Path, ...]
+    setup: StatedSetup
+
+    @property
+    def one_file(self) -> bool:
+        """Whether `read_stack` of that file gives the stack."""
+        return len(self.files) == 1
+
+
+def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
+    """The stack in one file, in several, or in a folder of them, in the natural order of their names.
+
+    series: as for `read_stack`; of each file.
+
+    Files of one plane each are the planes, in the order of the one number in their names that changes. Where two do,
+    such as c1 and z03, or a word does, one counts the prism settings. Files of several planes are a prism setting each.
+    Raises StackError for no file, a folder without images, files of different shapes or dtypes, and names from which no
+    order follows, and as `read_stack` does.
+    """
+    files, folder = _listed(paths)
+    stacks = [read_stack(file, series) for file in files]
+    said = setup_of_all(_setup(file) for file in files[:1])
+    beside = (folder or files[0].parent) / _METADATA
+    if beside.is_file():
+        said = said.completed(setup_in_words(beside.read_text(encoding="utf-8", errors="replace")))
+    if len(stacks) == 1:
+        return Gathered(_with_sizes(stacks[0], said), files, said)
+    source = f"{len(files)} files in {folder or files[0].parent}"
+    _check_alike(files, stacks)
+    if stacks[0].data.shape[:2] == (1, 1):
+        prisms, planes = _layout(files)
+        order = np.array(sorted(range(len(files)), key=lambda i: (prisms[i], planes[i])))
+        data = np.stack([stacks[i].data[0, 0] for i in order])
+        data = data.reshape(len(set(prisms)), -1, *data.shape[1:])
+    else:
+        order, data = np.arange(len(files)), np.concatenate([stack.data for stack in stacks])
+    joined = replace(stacks[0], data=data, names=(), source=source)
+    return Gathered(_with_sizes(joined, said), tuple(files[i] for i in order), said)
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """The key by which plane2 comes before plane10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part]
+
+
+def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
+    """The files in natural order, and the folder if one was named."""
+    if not paths:
+        raise StackError("no stack is named: give a file, several, or a folder of planes")
+    folders = [path for path in paths if path.is_dir()]
+    if not folders:
+        return tuple(sorted(paths, key=lambda path: natural(path.name))), None
+    if len(paths) > 1:
+        raise StackError(f"{folders[0]}: is a folder; give one folder, or files")
+    suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
+    found = [file for file in folders[0].iterdir() if file.name.lower().endswith(suffixes) and file.is_file()]
+    found = [file for file in found if not file.name.startswith(".")]
+    if not found:
+        raise StackError(f"{folders[0]}: holds no images ({', '.join(suffixes)})")
+    return tuple(sorted(found, key=lambda path: natural(path.name))), folders[0]
+
+
+def _setup(file: Path) -> StatedSetup:
+    setup = format_of(file).setup
+    return StatedSetup() if setup is None else setup(file)
+
+
+def _with_sizes(stack: Stack, said: StatedSetup) -> Stack:
+    """The stack with the sizes and bits that are said elsewhere than in its own header."""
+    pixel = stack.pixel_size
+    if pixel is None and said.pixel_size is not None:
+        pixel = (said.pixel_size, said.pixel_size)
+    fits = said.bits is not None and stack.data.dtype.kind in "iu" and int(stack.data.max()) < 2**said.bits
+    return replace(
+        stack,
+        pixel_size=pixel,
+        focus_step=stack.focus_step or (said.focus_step if stack.data.shape[1] > 1 else None),
+        bits=stack.bits or (said.bits if fits else None),
+    )
+
+
+def _check_alike(files: Sequence[Path], stacks: Sequence[Stack]) -> None:
+    for file, stack in zip(files, stacks, strict=True):
+        first = stacks[0].data
+        if stack.data.shape != first.shape or stack.data.dtype != first.dtype:
+            raise StackError(
+                f"{file}: holds {shape_text(stack.data.shape)} {stack.data.dtype}, {files[0].name} "
+                f"{shape_text(first.shape)} {first.dtype}; the files of a stack are alike"
+            )
+
+
+def _layout(files: Sequence[Path]) -> tuple[list[int], list[int]]:
+    """Which prism setting and which plane each file is, by what changes in their names."""
+    parts = [re.findall(r"\d+|[^\W\d_]+", file.stem) for file in files]
+    if len({tuple(part.isdigit() for part in name) for name in parts}) > 1:
+        raise StackError(f"{files[0].parent}: the names differ in more than numbers and words: {_two(files)}")
+    changing = [i for i in range(len(parts[0])) if len({name[i] for name in parts}) > 1]
+    prism = next((i for i in changing if _counts(parts[0], i, _OF_PRISMS)), None)
+    if prism is None and len(changing) == 2:
+        words = [i for i in changing if not parts[0][i].isdigit()]
+        of_planes = [i for i in changing if _counts(parts[0], i, _OF_PLANES)]
+        prism = next(iter([*words, *(i for i in changing if of_planes and i not in of_planes)]), None)
+    planes = [i for i in changing if i != prism]
+    if len(planes) > 1:
+        raise StackError(
+            f"{files[0].parent}: {len(changing)} parts of the names change ({_two(files)}): name prism settings "
+            "channel1, channel2, … and planes z1, z2, …"
+        )
+    of_prisms, of_planes = (
+        [natural(name[i[0]]) if i else [] for name in parts] for i in ([] if prism is None else [prism], planes)
+    )
+    settings, depths = sorted(map(tuple, {tuple(v) for v in of_prisms})), sorted({tuple(v) for v in of_planes})
+    if len(settings) * len(depths) != len(files):
+        raise StackError(
+            f"{files[0].parent}: {len(files)} files are not {len(settings)} settings × {len(depths)} planes"
+        )
+    return [settings.index(tuple(v)) for v in of_prisms], [depths.index(tuple(v)) for v in of_planes]
+
+
+def _counts(name: Sequence[str], index: int, words: Sequence[str]) -> bool:
+    """Whether the number at this place follows one of the words."""
+    return name[index].isdigit() and index > 0 and name[index - 1].lower() in words
+
+
+def _two(files: Sequence[Path]) -> str:
+    return f"{files[0].name}, {files[-1].name}"
