@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 # How often the search is moved to where the parabola has its least, and the step of the last one over the first's.
-MOVES, NARROWED = 3, 0.5
+MOVES, NARROWED = 6, 0.5
 
 # A least that lies further than this many steps from the trials' middle isn't believed, and the search moves there.
 WITHIN = 0.6

@@ -20,6 +20,9 @@ PLANES, AROUND = 7, 3.5
 # A fit that leaves more than this many times the noise's misfit, and this share of the contrast, isn't explained.
 POOR, LEAST = 1.5, 0.02
 
+# What slabs and directions move the aperture's logarithm by, as measured on known scenes.
+MODEL_APERTURE = 5e-3
+
 # A bias that is as uncertain as this, in rad, is said to be.
 UNSURE = math.radians(5)
 
@@ -88,7 +91,8 @@ def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> 
     if "condenser" in found.values:
         assert config.microscope.condenser is not None
         before = number(config.microscope.condenser.na)
-        na, sure = (before * found.values["condenser"] * part for part in (1.0, found.deviations["condenser"]))
+        deviation = found.deviations["condenser"].square().add(MODEL_APERTURE**2).sqrt()
+        na, sure = (before * found.values["condenser"] * part for part in (1.0, deviation))
         made.append(_of("condenser na", "", before, na, sure, how))
     where = f"{how}; the planes stay as told, because focus against z is a gauge"
     made.append(_of("bead's z", "µm", None, -found.values["focus_zero"], found.deviations["focus_zero"], where))
