@@ -59,6 +59,7 @@ def test_part_left_out_costs_what_is_stated(errors, name):
     assert float(ratio.max()) < 1.5, errors(name)
 
 
+@pytest.mark.slow
 def test_rays_and_corrected_split_step_err_by_thousandths(errors):
     """12 steps and linear interpolation leave rays 0.002; padding as the reference's would leave the wave 0.0012."""
     assert float(errors("rays", 60, replace(RAYS, steps=12)).max()) < 0.0025

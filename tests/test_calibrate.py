@@ -58,6 +58,7 @@ def calibrated(folder, recorded, monkeypatch, told, patches=FEW):
     return load(folder / "out" / "calibrated.toml"), json.loads((folder / "out" / "calibration.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_bead_leaves_a_microscope_to_be_reused(tmp_path, recorded, monkeypatch, capsys):
     told = {
         "acquisition": {"focus": FOCUS, "prisms": prisms(0.22, 26, 1.4)},  # too long, turned, too much

@@ -43,7 +43,7 @@ def test_orientation_independent_frames_have_two_axes_at_45_degrees_with_each_bi
     assert found == expected
 
 
-@pytest.mark.parametrize("name", ["four_frames", "six_frames"])
+@pytest.mark.parametrize("name", ["four_frames", pytest.param("six_frames", marks=pytest.mark.slow)])
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore:.*tells no scale")
 @pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")

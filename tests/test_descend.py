@@ -112,7 +112,7 @@ def test_the_linear_start_is_ahead_of_an_empty_one(truth):
     ("propagation", "method"),
     [
         pytest.param(propagation, method, marks=() if (propagation, method) in fast else pytest.mark.slow)
-        for fast in [{("projection", "newton"), ("rays", "adam"), ("wave", "adam")}]
+        for fast in [{("projection", "newton"), ("wave", "adam")}]
         for propagation in ("projection", "rays", "wave")
         for method in METHODS
     ],

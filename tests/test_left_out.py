@@ -81,8 +81,13 @@ def _fast(no_pictures):
     pass
 
 
-METHODS = [{"method": "newton"}, {"method": "adam"}, {"method": "linear"}, {"method": "opl"}]
-MISFITS = [pytest.param({"misfit": "poisson"}, marks=pytest.mark.slow, id="poisson"), {"misfit": "robust"}]
+METHODS = [
+    {"method": "newton"},
+    {"method": "adam"},
+    {"method": "linear"},
+    pytest.param({"method": "opl"}, marks=pytest.mark.slow, id="opl"),
+]
+MISFITS = [pytest.param({"misfit": name}, marks=pytest.mark.slow, id=name) for name in ("poisson", "robust")]
 
 
 @pytest.mark.parametrize("how", METHODS + MISFITS, ids=lambda how: next(iter(how.values())))
@@ -124,7 +129,9 @@ def test_a_clean_stack_leaves_nothing_out(run, counts):
     assert torch.equal(masked, found)
 
 
-@pytest.mark.parametrize("shape", [(32, 30), pytest.param((3, 32, 30), marks=pytest.mark.slow), (2, 3, 32, 30)])
+@pytest.mark.parametrize(
+    "shape", [(32, 30), *(pytest.param(shape, marks=pytest.mark.slow) for shape in ((3, 32, 30), (2, 3, 32, 30)))]
+)
 def test_what_the_users_mask_leaves_out_changes_nothing(run, counts, shape):
     mask = np.full(shape, 7, np.uint8)
     mask[..., 3:9, 20:28] = 0

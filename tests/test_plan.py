@@ -669,7 +669,7 @@ def test_plan_prints_its_table_and_leaves_it_as_json(write, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("command", "changes", "words"),
     [
-        ("plan", {"specimen": None}, "missing key specimen"),
+        ("plan", {"specimen": None, "data": None}, "missing key specimen or data.path"),
         ("plan", {"tolerance": -1.0}, "tolerance -1.0 must be above 0, and finite"),
         ("plan", {"tolerance": "fine"}, "'fine' must be a number"),
         ("simulate", {"fidelity": {"sources": 3}}, "tolerance 0.2 and [fidelity] exclude each other"),

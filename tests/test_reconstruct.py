@@ -225,7 +225,8 @@ def test_the_metrics_are_those_of_the_volume_left(workplace):
     assert [report["bias"] for report in metrics["prisms"]] == [1.5, -1.2]
 
 
-@pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["newton", "adam"])
 def test_another_misfit_is_in_the_metrics_and_the_log_by_its_own_value(other, workplace, tmp_path, method):
     given = {"newton": {"steps": 12}, "adam": {"steps": 8, "tv": [60.0, 5.0], "prior": "tv"}}[method]
     path, out = other({"reconstruction": {"method": method, **given}}), tmp_path / "out"

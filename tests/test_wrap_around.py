@@ -122,7 +122,8 @@ def test_light_that_is_cut_is_that_which_the_warning_names():
 
     (whole, wraps), (rest, is_cut) = mean(False), mean(True)
     part = float(re.search(r"([\d.]+) % of the light leaves the array and is cut", is_cut)[1]) / 100
-    assert wraps == is_cut.replace("is cut", "comes back in at the opposite side")
+    advice = ", and band_limit = true would cut it"
+    assert wraps == is_cut.replace("is cut", "comes back in at the opposite side") + advice
     assert part > UNREMARKED
     # named to two digits
     assert 1 - rest / whole == pytest.approx(part, rel=0.05)
