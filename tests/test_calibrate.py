@@ -88,10 +88,12 @@ def test_a_bead_leaves_a_microscope_to_be_reused(tmp_path, recorded, monkeypatch
 
 @pytest.mark.slow
 def test_an_unknown_specimen_tells_direction_and_leaves_what_sets_the_scale(tmp_path, recorded, monkeypatch, capsys):
-    told = {"acquisition": {"focus": FOCUS[::-1], "prisms": prisms(0.2, 14, 1.3)}}
+    assumed = ["bias", "shear's angle", "order of the planes", "sign of Δn"]
+    told = {"assumed": assumed, "acquisition": {"focus": FOCUS[::-1], "prisms": prisms(0.2, 14, 1.3)}}
     config, record = calibrated(tmp_path, recorded, monkeypatch, told)
     assert record["signs and orders"]["value"] == "focus"
     assert [float(f) for f in config.acquisition.focus] == FOCUS
+    assert config.assumed == ("bias", "sign of Δn")  # the others are found
     assert math.degrees(record["shear's angle"]["value"][0]) == pytest.approx(20, abs=3)
     for name in ("shear's length", "bias"):
         assert not record[name]["found"]

@@ -1,5 +1,6 @@
 """From a configuration and its stack to a calibrated configuration: signs and orders first, then values."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +24,15 @@ GAUGES = (
     "focus against z: planes that are all moved by the same distance move the volume",
     "shear and bias reversed together: they give the same images",
 )
+
+# What a configuration may list as assumed, by the quantity that tells it.
+ASSUMED = {
+    "signs and orders": "order of the planes",
+    "bias": "bias",
+    "shear's length": "shear's length",
+    "shear's angle": "shear's angle",
+    "condenser na": "condenser's NA",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +76,15 @@ def calibrate(config: Config, out: Path, device: torch.device, bead: ModelledSpe
     for quantity in found:
         print(quantity.words)
     print(f"not told by any image: {'; '.join(GAUGES)}")
-    calibration = Calibration(stack.config, orders, tuple(found))
+    calibration = Calibration(_known(stack.config, found), orders, tuple(found))
     write_calibration(out, calibration.config, orders, found, GAUGES, with_microscope=bead is not None)
     return calibration
+
+
+def _known(config: Config, found: Sequence[FoundQuantity]) -> Config:
+    """The configuration, in which what was told is no longer assumed."""
+    told = {ASSUMED.get(quantity.name) for quantity in found if quantity.told}
+    return replace(config, assumed=tuple(name for name in config.assumed if name not in told))
 
 
 def bounds_of(config: Config) -> Bounds:
