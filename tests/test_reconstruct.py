@@ -507,11 +507,15 @@ def test_a_signal_is_heeded_where_python_ignores_what_it_raises(other, tmp_path,
 
     monkeypatch.setattr(recorded, "minimise", minimise)
     out = tmp_path / "out"
-    code, err = command("reconstruct", other({"reconstruction": {"method": method, "steps": 8}}), "--out", out)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        code, err = command("reconstruct", other({"reconstruction": {"method": method, "steps": 8}}), "--out", out)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert code == 130
     assert "torchdic: error: interrupted after step 4 of 8; go on with --resume" in err
     assert len(rows(out)) == 4
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.fixture(scope="module")

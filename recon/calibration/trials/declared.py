@@ -15,6 +15,9 @@ ALIKE, ALIKE_BIAS = 0.15, 0.1
 # All orders of the prisms are tried where there are at most so many of them; of more, none.
 MOST_PRISMS = 4
 
+# What tells acquisitions apart: shear and bias of each prism, nothing for bright field, and the focus planes.
+_Images = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
+
 
 @dataclass(frozen=True, eq=False)
 class Otherwise:
@@ -134,17 +137,18 @@ def all_mistakes(declared: Acquisition) -> list[Otherwise]:
         if back:
             steps.append(_reversed(steps[-1].acquisition if steps else declared))
         found.append(_together(declared, steps))
-    distinct: list[Otherwise] = []
+    distinct: list[tuple[_Images, Otherwise]] = []
     # among equals a sign or an axis is the plainer mistake than exchanged prisms
     for other in sorted(found, key=lambda other: (other.mistakes, "prisms" in other.name)):
-        if not any(_alike(other.acquisition, known.acquisition) for known in distinct):
-            distinct.append(other)
-    return distinct
+        images = images_of(other.acquisition)
+        if not any(_alike(images, known) for known, _ in distinct):
+            distinct.append((images, other))
+    return [other for _, other in distinct]
 
 
-def _alike(one: Acquisition, other: Acquisition) -> bool:
-    """Whether two acquisitions give nearly the same images."""
-    (prisms, focus), (others, planes) = images_of(one), images_of(other)
+def _alike(one: _Images, other: _Images) -> bool:
+    """Whether two acquisitions, as `images_of` tells them apart, give nearly the same images."""
+    (prisms, focus), (others, planes) = one, other
     if focus != planes or [len(a) for a in prisms] != [len(b) for b in others]:
         return False
     for (*shear, bias), (*shear_of_other, bias_of_other) in (
@@ -155,7 +159,7 @@ def _alike(one: Acquisition, other: Acquisition) -> bool:
     return True
 
 
-def images_of(acquisition: Acquisition) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]:
+def images_of(acquisition: Acquisition) -> _Images:
     """What tells acquisitions apart. A prism of the other shear and bias is the same one, with its beams renamed."""
     prisms = []
     for prism in acquisition.prisms:
