@@ -1,6 +1,6 @@
 """Annotations are enforced here, and only here: each call checks the shapes and types it was promised.
 
-`make test` checks the first 10 calls of each function in each test, `make test-all` every one.
+`make test` checks the first 4 calls of each function in each test, `make test-all` every one.
 """
 
 import functools
@@ -167,7 +167,7 @@ def measured_file():
 
 def pytest_configure(config):
     global most_calls
-    most_calls = 10 if config.option.markexpr == "not slow" else math.inf
+    most_calls = 4 if config.option.markexpr == "not slow" else math.inf
 
 
 def pytest_addoption(parser):

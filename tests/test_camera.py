@@ -357,7 +357,12 @@ def test_what_a_pixel_passes_of_a_wave_is_what_its_mean_leaves(side):
 
 
 @pytest.mark.parametrize(
-    "recipe", [{"steps": 3}, {"steps": 3, "support": "edges", "margin": 3}, {"steps": 12, "method": "adam"}]
+    "recipe",
+    [
+        {"steps": 3},
+        pytest.param({"steps": 3, "support": "edges", "margin": 3}, marks=pytest.mark.slow),
+        {"steps": 12, "method": "adam"},
+    ],
 )
 @pytest.mark.usefixtures("no_pictures")
 def test_a_stack_on_the_cameras_pixels_is_reconstructed_on_the_volumes_voxels(config, tmp_path, capsys, recipe):

@@ -22,7 +22,7 @@ coarse = pytest.mark.filterwarnings(
 )
 # the same examples every time: a failure is the code's, not the day's
 few = settings(
-    max_examples=12, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=8, deadline=None, derandomize=True, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
 
 
