@@ -12,6 +12,7 @@ from data_synthetic import Bead
 from recon.calibration.trials.orders import Round
 from recon.cli import main
 from recon.config import load
+from recon.run.calibration.stack import CalibrationStack
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.files.stack import write_stack
 
@@ -140,3 +141,21 @@ def test_levels_of_one_exposure_tell_the_compensators_zero(tmp_path, recorded, m
     config, record = calibrated(tmp_path, recorded, monkeypatch, told)
     assert record["compensator's zero"]["value"] == pytest.approx(-0.1, abs=0.03)
     assert float(config.acquisition.prisms[0].bias) == pytest.approx(1.3, abs=0.03)
+
+
+def test_short_fits_have_the_cameras_pixels_as_voxels(tmp_path, recorded):
+    """Voxels of half a pixel describe the same stack: its part is that of a configuration without a camera."""
+    volume = {"shape": [8, 80, 72], "spacing": [0.5, 0.1, 0.1], "background": 1.4}
+    microscope = TOLD["microscope"] | {"camera": {"pixel_size": 0.2}}
+    acquisition = {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}
+    write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    parts = []
+    for name, changes in (("plain", {}), ("camera", {"volume": volume, "microscope": microscope})):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(tomli_w.dumps({**TOLD, "acquisition": acquisition, **changes}), encoding="utf-8")
+        stack = CalibrationStack.read(load(path), torch.device("cpu"))
+        parts.append(stack.part())
+        assert stack.beside().setup.microscope.camera is None
+    plain, camera = parts
+    assert camera.grid == plain.grid
+    assert torch.allclose(camera.data, plain.data, rtol=1e-5)

@@ -16,8 +16,8 @@ from recon.fit.problem import Problem, Recipe
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
-from recon.run.data import load_data
-from torchdic import Acquisition, Fidelity
+from recon.run.data import camera_pixels, load_data
+from torchdic import Acquisition, Fidelity, Grid, Microscope
 
 # Slices of the volumes by which signs and orders are told, before a round has fewer.
 COARSE = 20
@@ -49,13 +49,23 @@ class CalibrationStack:
         """Standard deviation of each prism's noise; 0 where it isn't known."""
         return self.measured.noise or [0.0] * len(self.data)
 
+    @property
+    def pixels(self) -> Grid:
+        """The stack's pixels, and the volume's slices, as a grid: the voxels of all short fits."""
+        return camera_pixels(self.config)
+
+    @property
+    def microscope(self) -> Microscope:
+        """The microscope without its camera, whose pixels are the voxels."""
+        return replace(self.config.microscope, camera=None)
+
     def with_config(self, config: Config) -> "CalibrationStack":
         """The same, with more calibrated. The data stay relative to the empty field of the biases that were told."""
         return replace(self, config=config)
 
     def part(self, pixels: int = PIXELS, planes: int = PLANES, slices: int = SLICES) -> Part:
         """The part around the strongest structure; at most so many of each."""
-        return part_of(self.data, self.mask, self.config.volume.grid, pixels, planes, slices)
+        return part_of(self.data, self.mask, self.pixels, pixels, planes, slices)
 
     def orders(self, bounds: Bounds) -> Orders | None:
         """Signs and orders by short fits; None where no linear response lets them be made. bounds: of Δn."""
@@ -64,7 +74,7 @@ class CalibrationStack:
 
         def problem_of(acquisition: Acquisition, slices: int, recipe: Recipe) -> Problem:
             some = part.sliced(slices)
-            setup = some.setup(config.volume.background, config.microscope, acquisition)
+            setup = some.setup(config.volume.background, self.microscope, acquisition)
             return Problem.from_recipe(
                 some.data, setup, fidelity, recipe, lambda data: GaussianMisfit(data, mask=some.mask), self.noise
             )
@@ -77,7 +87,7 @@ class CalibrationStack:
         """The part of the stack beside a volume that is fitted to it; the volume goes on where the specimen is cut."""
         config, part = self.config, self.part(planes=planes)
         recipe = Recipe(bounds=config.reconstruction.bounds, prior=config.reconstruction.prior)
-        scene = part.grid, config.microscope, config.volume.background
+        scene = part.grid, self.microscope, config.volume.background
         margin = needed_margin(part.data.cpu().numpy(), self.noise, *scene)
-        setup = part.setup(config.volume.background, config.microscope, config.acquisition, margin)
+        setup = part.setup(config.volume.background, self.microscope, config.acquisition, margin)
         return Beside(part, setup, recipe, self.noise)
