@@ -1,9 +1,7 @@
 """torchdic simulate: the DIC images of a known specimen."""
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from recon.report import figures
 from recon.run.exact_images import exact_images
 from recon.run.reconstruct import prepare_folder
 from torchdic import STANDARD, Fidelity, Volume, image, plan
-from torchdic.files.stack import write_stack
+from torchdic.files.stack import equal_step, write_stack
 from torchdic.files.whole import write_json
 from torchdic.forward.foresee import check_fits
 
@@ -86,11 +84,3 @@ def _write(config: Config, images: Tensor, out: Path) -> None:
         leave_resolved(config, out)
     prisms, planes, ny, nx = images.shape
     print(f"{out / 'stack.ome.tif'}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")
-
-
-def equal_step(focus: Sequence[float]) -> float | None:
-    """The distance in µm between focus planes; None unless they rise in equal steps."""
-    steps = [b - a for a, b in pairwise(focus)]
-    if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
-        return None
-    return steps[0]

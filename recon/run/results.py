@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from recon.report.verdict import PoorFitWarning, Verdict, judged
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
 from torchdic import Grid
 from torchdic.errors import StackError
-from torchdic.files.stack import write_stack, write_volume
+from torchdic.files.stack import equal_step, write_stack, write_volume
 from torchdic.files.whole import WriteError, write_json
 
 VOLUME, METRICS = "volume.ome.tif", "metrics.json"
@@ -131,7 +130,7 @@ def write_results(
 
     def write_sections() -> None:
         if sections is not None:
-            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], _focus_step(measured))
+            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], equal_step(measured.focus))
 
     def draw_images() -> None:
         figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)
@@ -177,12 +176,7 @@ def _write_images(
     """Write the measured images beside the model's, two channels for each prism. Raises StackError."""
     names = [f"{kind}, prism {prism}" for prism in range(len(data)) for kind in ("measured", "modelled")]
     pairs = torch.stack([data, images], 1).flatten(0, 1)
-    write_stack(path, pairs, measured.pixel_size, _focus_step(measured), names=names)
-
-
-def _focus_step(measured: Measured) -> float | None:
-    """The distance in µm between the first two focus planes; None of a single one."""
-    return next((abs(b - a) for a, b in pairwise(measured.focus)), None)
+    write_stack(path, pairs, measured.pixel_size, equal_step(measured.focus), names=names)
 
 
 def _write_volume(path: Path, delta: Float[Tensor, "z y x"], grid: Grid, name: str = "delta n") -> None:

@@ -6,6 +6,7 @@ To add a format, write one file beside `torchdic.files.tiff` that defines a `For
 import math
 import os
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -63,6 +64,14 @@ def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack
         raise StackError(f"{path}: cannot be read as {known.name}: {type(error).__name__}: {reason}") from error
     _check_finite(stack.data, path)
     return stack
+
+
+def equal_step(focus: Sequence[float]) -> float | None:
+    """The distance in µm between focus planes; None unless they rise in equal steps."""
+    steps = [b - a for a, b in pairwise(focus)]
+    if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
+        return None
+    return steps[0]
 
 
 def write_stack(
