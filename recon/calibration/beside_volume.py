@@ -14,7 +14,7 @@ from torch import Tensor
 from recon.calibration.optics import CondenserAperture, ShearOfAxes, axes_of
 from recon.calibration.part import Part
 from recon.calibration.trials.profile import Least, least_misfit
-from recon.calibration.trials.short_fits import coarse_steps
+from recon.calibration.trials.short_fits import last_step
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
@@ -59,28 +59,23 @@ class Beside:
 
     def held(self) -> "Beside":
         """The same with the priors' weight held at what it comes to now: trials differ by it else."""
-        weights = self.fitted(self.setup).weights
+        weights = _last(self.problem(self.setup)).weights
         return self if not weights else replace(self, weight=float(weights[-1]["tv"]))
 
     def problem(self, setup: Setup) -> Problem:
         """The fit of a volume with these optics."""
         recipe = self.recipe
         if self.weight is not None:
-            sparse = recipe.sparse if recipe.tv == "auto" else 0.25
-            recipe = replace(recipe, tv=(self.weight, self.weight), l1=sparse * self.weight)
+            recipe = recipe.held(self.weight)
         fidelity, mask = Fidelity("wave", sources=SOURCES), self.part.mask
         return Problem.from_recipe(
             self.part.data, setup, fidelity, recipe, lambda data: GaussianMisfit(data, mask=mask), list(self.noise)
         )
 
-    def fitted(self, setup: Setup) -> Step:
-        """The last step of a fit. Raises ValueError where the light can't be followed."""
-        return _last(self.problem(setup))
-
     def misfits(self, setup: Setup) -> np.ndarray:
         """The misfit of each image, relative to its prism's spatial variance, after a fit."""
         problem = self.problem(setup)
-        last = self.fitted(setup)
+        last = _last(problem)
         with torch.no_grad():
             images = with_values(problem.unknowns, last.values, setup).images(Fidelity("wave", sources=SOURCES))
         misfit = problem.misfit
@@ -139,7 +134,8 @@ def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
 
 
 def _last(problem: Problem) -> Step:
-    steps = list(coarse_steps(problem, STEPS, SOURCES))
-    if not steps:
+    """The last step of a fit. Raises ValueError where the light can't be followed."""
+    last = last_step(problem, STEPS, SOURCES)
+    if last is None:
         raise ValueError("no volume can be fitted with these optics")
-    return steps[-1]
+    return last

@@ -14,7 +14,7 @@ from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.shear import turned_prism
 from recon.fit.setup import Setup
 from recon.misfit.base import Misfit
-from torchdic import Acquisition
+from torchdic import Acquisition, Prism
 from torchdic.scalar import number
 
 
@@ -159,6 +159,15 @@ def axes_of(acquisition: Acquisition) -> tuple[int, ...]:
             known.append(shear)
         found.append(axis)
     return tuple(found)
+
+
+def firsts_of(acquisition: Acquisition) -> list[Prism]:
+    """The first prism of each shear axis, in the order of `axes_of`."""
+    found: dict[int, Prism] = {}
+    for prism, axis in zip(acquisition.prisms, axes_of(acquisition), strict=True):
+        if prism is not None:
+            found.setdefault(axis, prism)
+    return [found[axis] for axis in sorted(found)]
 
 
 def _same_line(a: Sequence[float], b: Sequence[float]) -> bool:

@@ -109,6 +109,10 @@ class Recipe:
         """Weight of the mean |Δn|, relative to that of the edges where it follows the noise."""
         return self.l1 if self.l1 is not None else SPARSE if self.tv == "auto" else ALONE
 
+    def held(self, weight: float) -> "Recipe":
+        """The recipe whose priors keep a weight that followed the noise."""
+        return replace(self, tv=(weight, weight), l1=self.sparse * weight)
+
     def priors(self) -> list[Prior]:
         """The priors, with weights relative to the common one where that follows the noise."""
         first, last = (1.0, 1.0) if self.tv == "auto" else self.tv

@@ -1,6 +1,7 @@
 """How long a descent will take: foreseen before its first step, and followed as its steps are taken."""
 
 import warnings
+from collections import deque
 from collections.abc import MutableMapping
 from statistics import mean
 from typing import Any
@@ -33,7 +34,8 @@ class Forecast:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._costs = [_cost(problem, number) for number in range(problem.steps)]
-        self._taken: list[tuple[float, float]] = []
+        self._last: deque[tuple[float, float]] = deque(maxlen=LAST)
+        self._of_kind: dict[float, deque[float]] = {}
 
     def cost(self, number: int) -> float:
         """What a step costs, in the work of its images. number: counted from 0."""
@@ -41,20 +43,22 @@ class Forecast:
 
     def taken(self, number: int, spent: float) -> None:
         """Note the seconds that a step took; number: counted from 1."""
-        self._taken.append((self._costs[number - 1], spent))
+        cost = self._costs[number - 1]
+        self._last.append((cost, spent))
+        self._of_kind.setdefault(cost, deque(maxlen=LAST)).append(spent)
 
     def left(self, number: int) -> float | None:
         """The seconds that the steps after one will take, if all are taken. number: steps so far. None is unknown."""
         rate = self._rate() if number < len(self._costs) else 0.0
         if rate is None:
             return None
-        known = {cost: mean([s for c, s in self._taken if c == cost][-LAST:]) for cost, _ in self._taken}
+        known = {cost: mean(seconds_taken) for cost, seconds_taken in self._of_kind.items()}
         return sum(known.get(cost, rate * cost) for cost in self._costs[number:])
 
     def _rate(self) -> float | None:
         """Seconds for each unit of cost."""
-        if self._taken:
-            costs, spent = (sum(column) for column in zip(*self._taken[-LAST:], strict=True))
+        if self._last:
+            costs, spent = (sum(column) for column in zip(*self._last, strict=True))
             return spent / costs
         fidelity = _careful(self._problem)
         if fidelity is None:

@@ -151,12 +151,11 @@ def _alike(one: _Images, other: _Images) -> bool:
     (prisms, focus), (others, planes) = one, other
     if focus != planes or [len(a) for a in prisms] != [len(b) for b in others]:
         return False
-    for (*shear, bias), (*shear_of_other, bias_of_other) in (
-        pair for pair in zip(prisms, others, strict=True) if pair[0]
-    ):
-        if math.dist(shear, shear_of_other) > ALIKE * math.hypot(*shear) or abs(bias - bias_of_other) > ALIKE_BIAS:
-            return False
-    return True
+    return all(
+        math.dist(a[:2], b[:2]) <= ALIKE * math.hypot(*a[:2]) and abs(a[2] - b[2]) <= ALIKE_BIAS
+        for a, b in zip(prisms, others, strict=True)
+        if a
+    )
 
 
 def images_of(acquisition: Acquisition) -> _Images:

@@ -9,11 +9,11 @@ have one weight, that at which the best volume so far leaves the noise, and what
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
-from recon.calibration.trials.short_fits import coarse_steps
+from recon.calibration.trials.short_fits import last_step
 from recon.fit.problem import Problem, Recipe
 from recon.fit.step import Step
 from torchdic import Acquisition
@@ -123,7 +123,7 @@ class _Race:
         this = ROUNDS[number - 1]
         problem = self._problem_of(other.acquisition, this.slices, recipe)
         self.alone = problem.misfit.of_noise(self._noise) or 0.0
-        return _last(problem, this.steps, this.sources)
+        return last_step(problem, this.steps, this.sources)
 
     def best(self, most: int) -> list[Otherwise]:
         """The best so many of the last round, and the declared one, with which the others are compared."""
@@ -138,17 +138,11 @@ class _Race:
         return left[0] < STANDS_OUT * left[len(left) // 2]
 
 
-def _last(problem: Problem, steps: int, sources: int) -> Step | None:
-    last = list(coarse_steps(problem, steps, sources))
-    return last[-1] if last else None
-
-
 def _held(recipe: Recipe, last: Step | None) -> Recipe:
     """The recipe with the priors' weight held at what it came to; as it is where that isn't known."""
     if recipe.tv != "auto" or last is None or not last.weights:
         return recipe
-    weight = float(last.weights[-1]["tv"])
-    return replace(recipe, tv=(weight, weight), l1=recipe.sparse * weight)
+    return recipe.held(float(last.weights[-1]["tv"]))
 
 
 def _chosen(ranked: tuple[Tried, ...], noise: float) -> Orders:

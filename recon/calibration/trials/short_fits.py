@@ -39,6 +39,14 @@ def short_fit(problem: Problem, steps: int = STEPS, sources: int = SOURCES) -> f
     return min((step.misfit for step in coarse_steps(problem, steps, sources)), default=math.inf)
 
 
+def last_step(problem: Problem, steps: int, sources: int) -> Step | None:
+    """The last step of a short fit; None where the light can't be followed."""
+    last = None
+    for step in coarse_steps(problem, steps, sources):
+        last = step
+    return last
+
+
 def coarse_steps(problem: Problem, steps: int, sources: int) -> Iterator[Step]:
     """The steps of a short fit; they end where the light can't be followed."""
     coarse = GivenFidelity(Fidelity("wave", sources=sources), None)

@@ -1,5 +1,6 @@
 """Values from a stack of a bead of known size and index."""
 
+import cmath
 import math
 from dataclasses import replace
 
@@ -7,11 +8,11 @@ import torch
 from torch import Tensor
 
 from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
-from recon.calibration.optics import axes_of
+from recon.calibration.optics import firsts_of
 from recon.config.schema import BeadSection, Config, ConfigError
-from recon.run.calibration.found import FoundQuantity, Value, plain
+from recon.run.calibration.found import FoundQuantity, Value, plain, rounded, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
-from torchdic import Acquisition, Prism
+from torchdic import Acquisition
 from torchdic.scalar import number
 
 # Planes of the stack, and µm of light around the bead on each side, that its fit takes.
@@ -35,8 +36,7 @@ def by_bead(
     Raises ConfigError where the field is no larger than the bead, or the bead isn't found in it.
     """
     config = stack.config
-    pixel = min(config.volume.spacing[1:])
-    extent = min(config.volume.grid.extent[1:])
+    pixel, extent = min(stack.pixels.spacing[1:]), min(stack.pixels.extent[1:])
     if extent < 1.2 * bead.width:
         raise ConfigError(
             f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
@@ -55,29 +55,26 @@ def by_bead(
 def _calibrated(config: Config, found: OpticsFound) -> Config:
     """The configuration with the optics that were found."""
     acquisition, microscope = found.setup.acquisition, found.setup.microscope
-    prisms = [None if prism is None else _plain_prism(prism) for prism in acquisition.prisms]
+    prisms = [
+        None if prism is None else replace(rounded_shear(prism), bias=rounded(prism.bias, 5))
+        for prism in acquisition.prisms
+    ]
     condenser, objective = config.microscope.condenser, config.microscope.objective
     if condenser is not None and microscope.condenser is not None and condenser.points is None:
         inner = microscope.condenser.inner_na
         condenser = replace(
             condenser,
-            na=float(f"{microscope.condenser.na:.5g}"),
-            inner_na=None if inner is None else float(f"{inner:.5g}"),
+            na=rounded(microscope.condenser.na, 5),
+            inner_na=None if inner is None else rounded(inner, 5),
         )
     if objective is not None and microscope.objective is not None and microscope.objective.aberrations:
-        terms = {term: float(f"{number(v):.4g}") for term, v in microscope.objective.aberrations.items()}
+        terms = {term: rounded(v, 4) for term, v in microscope.objective.aberrations.items()}
         objective = replace(objective, aberrations=terms)
     return replace(
         config,
         acquisition=Acquisition(prisms, config.acquisition.focus),
         microscope=replace(config.microscope, condenser=condenser, objective=objective),
     )
-
-
-def _plain_prism(prism: Prism) -> Prism:
-    y, x = (float(f"{number(component):.5g}") for component in prism.shear)
-    axis = None if prism.axis is None else float(f"{number(prism.axis):.5g}")
-    return Prism((y, x), float(f"{number(prism.bias):.5g}"), axis)
 
 
 def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> list[FoundQuantity]:
@@ -116,26 +113,19 @@ def _aberrations(config: Config, found: OpticsFound, how: str) -> FoundQuantity:
     terms, known = config.calibration.aberrations, dict(objective.aberrations or {})
     before = {str(term): number(known.get(term, 0.0)) for term in terms}
     added, sure = (plain(part, 4) for part in (found.values["aberrations"], found.deviations["aberrations"]))
-    values = {name: float(f"{told + more:.4g}") for (name, told), more in zip(before.items(), added, strict=True)}
+    values = {name: rounded(told + more, 4) for (name, told), more in zip(before.items(), added, strict=True)}
     return FoundQuantity("aberrations", "rad", before, values, dict(zip(before, sure, strict=True)), how)
 
 
 def _shears(config: Config, found: OpticsFound, how: str) -> list[FoundQuantity]:
     """Length and angle of each axis's shear, by its first prism."""
-    axes = axes_of(config.acquisition)
-    prisms = config.acquisition.prisms
-    firsts = [next(i for i, p in enumerate(prisms) if p is not None and axes[i] == a) for a in sorted(set(axes))]
-    told, now = [], []
-    for index in firsts:
-        for listed, acquisition in ((told, config.acquisition), (now, found.setup.acquisition)):
-            prism = acquisition.prisms[index]
-            assert prism is not None
-            y, x = (number(component) for component in prism.shear)
-            listed.append((math.hypot(y, x), math.atan2(y, x)))
+    told, now = (
+        [cmath.polar(complex(number(prism.shear[1]), number(prism.shear[0]))) for prism in firsts_of(acquisition)]
+        for acquisition in (config.acquisition, found.setup.acquisition)
+    )
     deviations = found.deviations["shear"]
-    lengths = [float(f"{length:.5g}") for length, _ in now]
+    lengths, angles = ([rounded(value, 5) for value in values] for values in zip(*now, strict=True))
     sure = plain(torch.tensor(lengths) * deviations[:, 0].cpu(), 2)
-    angles = [float(f"{angle:.5g}") for _, angle in now]
     note = f"{how}; from +x towards +y (down)"
     return [
         FoundQuantity("shear's length", "µm", [length for length, _ in told], lengths, sure, how),

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from recon.calibration.levels import UNSURE, biases_of_levels
-from recon.run.calibration.found import FoundQuantity
+from recon.run.calibration.found import FoundQuantity, rounded
 from recon.run.calibration.stack import CalibrationStack
 from torchdic.scalar import number
 
@@ -27,18 +27,18 @@ def by_levels(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuan
     before = [bias for bias in declared if bias is not None]
     if all(told for told, bias in zip(found.told, declared, strict=True) if bias is not None):
         biases = found.biases
-        values = [float(f"{bias:.5g}") for bias in biases if bias is not None]
-        sure = [float(f"{deviation:.2g}") for deviation in found.deviations if deviation is not None]
+        values = [rounded(bias, 5) for bias in biases if bias is not None]
+        sure = [rounded(deviation, 2) for deviation in found.deviations if deviation is not None]
         quantity = FoundQuantity("bias", "rad", before, values, sure, how)
     elif found.zero_deviation < UNSURE:
         biases = tuple(None if bias is None else bias + found.zero for bias in declared)
         how += "; it is added to each bias, whose size stays as told: these settings tell the zero alone"
-        zero, deviation = float(f"{found.zero:.4g}"), float(f"{found.zero_deviation:.2g}")
+        zero, deviation = rounded(found.zero, 4), rounded(found.zero_deviation, 2)
         quantity = FoundQuantity("compensator's zero", "rad", 0.0, zero, deviation, how)
     else:
         return stack, []
     changed = [
-        prism if prism is None or bias is None else replace(prism, bias=float(f"{bias:.5g}"))
+        prism if prism is None or bias is None else replace(prism, bias=rounded(bias, 5))
         for prism, bias in zip(prisms, biases, strict=True)
     ]
     calibrated = replace(config, acquisition=replace(config.acquisition, prisms=changed))

@@ -6,11 +6,11 @@ from dataclasses import replace
 import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images
-from recon.calibration.optics import ShearOfAxes, axes_of
+from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
-from recon.run.calibration.found import FoundQuantity, left, plain
+from recon.run.calibration.found import FoundQuantity, left, plain, rounded, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
 from torchdic import Acquisition
 from torchdic.scalar import number
@@ -71,25 +71,21 @@ def _untold(config: Config, known: set[str]) -> list[FoundQuantity]:
 
 def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, FoundQuantity]:
     config = stack.config
-    axes = axes_of(config.acquisition)
     found = find_angles(beside)
-    prisms = config.acquisition.prisms
-    firsts = [next(p for i, p in enumerate(prisms) if p is not None and axes[i] == a) for a in range(len(found))]
-    told = [math.atan2(number(prism.shear[0]), number(prism.shear[1])) for prism in firsts]
+    told = [math.atan2(number(p.shear[0]), number(p.shear[1])) for p in firsts_of(config.acquisition)]
     name, unit = "shear's angle", "rad"
     if max(least.deviation for least in found) > UNSURE_ANGLE:
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
         return stack, left(name, unit, told, why)
     turned = torch.tensor([[1.0, least.value] for least in found], dtype=torch.float64)
-    values = [float(f"{t + least.value:.5g}") for t, least in zip(told, found, strict=True)]
-    sure = [float(f"{math.hypot(least.deviation, MODEL_ANGLE):.2g}") for least in found]
+    values = [rounded(t + least.value, 5) for t, least in zip(told, found, strict=True)]
+    sure = [rounded(math.hypot(least.deviation, MODEL_ANGLE), 2) for least in found]
     how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from +x towards +y (down)"
-    acquisition = _rounded(
-        ShearOfAxes(axes).put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
-    )
-    return stack.with_config(replace(config, acquisition=acquisition)), FoundQuantity(
-        name, unit, told, values, sure, how
-    )
+    unknown = ShearOfAxes(axes_of(config.acquisition))
+    made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
+    prisms = [None if prism is None else rounded_shear(prism) for prism in made.prisms]
+    calibrated = replace(config, acquisition=replace(made, prisms=prisms))
+    return stack.with_config(calibrated), FoundQuantity(name, unit, told, values, sure, how)
 
 
 def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, list[FoundQuantity]]:
@@ -106,8 +102,8 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
     deviation = math.hypot(found.deviation, MODEL_APERTURE)
     if deviation > UNSURE_APERTURE:
         return stack, [left(name, "", before, "volumes explain the images as well with other apertures")]
-    na = float(f"{before * math.exp(found.value):.4g}")
-    sure = float(f"{na * deviation:.2g}")
+    na = rounded(before * math.exp(found.value), 4)
+    sure = rounded(na * deviation, 2)
     how = f"volumes fitted with {_tried([found])} apertures, misfit {_best([found], beside)}"
     if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
@@ -141,20 +137,6 @@ def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuanti
 def _of_part(stack: CalibrationStack, beside: Beside) -> Acquisition:
     acquisition = stack.config.acquisition
     return replace(acquisition, focus=[acquisition.focus[plane] for plane in beside.part.planes])
-
-
-def _rounded(acquisition: Acquisition) -> Acquisition:
-    prisms = [
-        None
-        if prism is None
-        else replace(
-            prism,
-            shear=tuple(float(f"{number(part):.5g}") for part in prism.shear),
-            axis=None if prism.axis is None else float(f"{number(prism.axis):.5g}"),
-        )
-        for prism in acquisition.prisms
-    ]
-    return replace(acquisition, prisms=prisms)
 
 
 def _tried(found: list[Least]) -> int:

@@ -108,17 +108,8 @@ def _of_orders(orders: Orders | None, config: Config) -> FoundQuantity:
     if others:
         nearest = min(others, key=lambda tried: tried.misfit)
         how += f", {nearest.misfit / unit:.2f} × with {nearest.otherwise.name}"
-    bounds = config.reconstruction.bounds
-    free = (
-        config.calibration.bead is None
-        and None in (bounds.lower, bounds.upper)
-        and 0
-        not in (
-            bounds.lower,
-            bounds.upper,
-        )
-    )
-    if free:
+    limits = bounds_of(config).lower, bounds_of(config).upper
+    if None in limits and 0 not in limits:
         how += "; the sign of Δn is free: signs and planes reversed together explain the images as well with −Δn"
     if not orders.told:
         how += "; the images hardly tell these two apart"

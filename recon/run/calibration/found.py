@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+
+from torchdic import Prism
+from torchdic.scalar import number
 
 # A value, or one for each prism, axis, image, …
 Value = Any
@@ -54,13 +57,24 @@ def left(name: str, unit: str, before: Value, why: str) -> FoundQuantity:
     return FoundQuantity(name, unit, before, before, None, why, told=False)
 
 
+def rounded(value: Any, digits: int) -> float:
+    """A number, or a tensor of one, of a few significant digits."""
+    return float(f"{number(value):.{digits}g}")
+
+
+def rounded_shear(prism: Prism) -> Prism:
+    """A prism whose shear and axis have five significant digits; its bias stays as it is."""
+    y, x = (rounded(part, 5) for part in prism.shear)
+    return replace(prism, shear=(y, x), axis=None if prism.axis is None else rounded(prism.axis, 5))
+
+
 def plain(value: torch.Tensor, digits: int = 6) -> Value:
     """A tensor as numbers of a few significant digits, in lists of its shape."""
 
-    def rounded(number: Any) -> Any:
-        return [rounded(part) for part in number] if isinstance(number, list) else float(f"{number:.{digits}g}")
+    def of(values: Any) -> Any:
+        return [of(part) for part in values] if isinstance(values, list) else rounded(values, digits)
 
-    return rounded(value.detach().double().tolist())
+    return of(value.detach().double().tolist())
 
 
 def _short(value: Value, digits: int = 4) -> str:
