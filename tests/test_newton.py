@@ -434,15 +434,16 @@ def test_a_correction_makes_drafts_careful_and_rests_where_it_hardly_moves(scene
     _, setup, _, _ = scene
     careful, draft = Fidelity(sources=18), Fidelity(sources=4)
     formed = setup.formed(draft)
-    made = Correction().renewed(setup, formed, careful, lambda change: 1.0)
-    torch.testing.assert_close(made.to(formed), setup.formed(careful))
+    delta = setup.volume.delta
+    made = Correction().renewed(setup, formed, careful, None, lambda change: 1.0)
+    torch.testing.assert_close(made.to(formed, delta, None), setup.formed(careful))
     assert made.rest == 0
-    again = made.renewed(setup, formed, careful, lambda change: 0.0)
+    again = made.renewed(setup, formed, careful, None, lambda change: 0.0)
     assert again.rest == REST
-    kept = again.renewed(setup, formed + 1, careful, lambda change: 0.0)
+    kept = again.renewed(setup, formed + 1, careful, None, lambda change: 0.0)
     assert kept.added is again.added
     assert kept.rest == REST - 1
-    assert Correction().to(formed) is formed
+    assert Correction().to(formed, delta, None) is formed
 
 
 def test_where_it_ends_the_volume_explains_the_data_by_careful_images():

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.fit.newton.correction import Correction, drafts
+from recon.fit.newton.missed import MissedResponse
 from recon.fit.newton.proximal import Penalties, Split, minimised
 from recon.fit.newton.secants import MEMORY, Pair, Secants
 from recon.fit.newton.weak_hessian import WeakHessian, check_linear_response
@@ -163,6 +164,7 @@ class _Descent:
         self.ratio = grid.spacing[2] / grid.spacing[0]
         self.voxels = math.prod(grid.shape)
         self.plans: tuple[PlanRecord, ...] = ()
+        self.missed: MissedResponse | None = None
 
     def steps(self, resume: Step | None) -> Iterator[Step]:
         started, problem = time.perf_counter(), self.problem
@@ -182,7 +184,8 @@ class _Descent:
                 elif turns:
                     place, hessian, now = self.turned(place, draft, exact)
                 elif hessian is None or now is None:
-                    hessian, now = self.hessian(place.responding, draft), self.judged(self.formed(place, draft))
+                    hessian = self.responses(place.responding, draft, exact)
+                    now = self.judged(self.formed(place, draft))
             except UnstableError as error:
                 raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
             place = self.weighted(place, now, number)
@@ -233,7 +236,8 @@ class _Descent:
 
     def seen(self, place: Place, delta: Tensor, images: Float[Tensor, "prism focus y x"]) -> Formed:
         """Images that were formed of delta, as a place's nuisances and its correction make them."""
-        recorded = self.placed(place, delta).recorded(place.correction.to(images))
+        corrected = place.correction.to(images, delta, self.missed)
+        recorded = self.placed(place, delta).recorded(corrected)
         return Formed(delta, images, recorded, self.problem.misfit(recorded))
 
     def judged(self, formed: Formed) -> Judged:
@@ -248,7 +252,8 @@ class _Descent:
         """
         known = place
         if exact is not None:
-            correction = place.correction.renewed(self.placed(place), formed.images, exact, self.size)
+            setup = self.placed(place)
+            correction = place.correction.renewed(setup, formed.images, exact, self.missed, self.size)
             place = replace(place, correction=correction)
         changed = False
         if self.nuisances and place.accepted > 0:
@@ -262,7 +267,7 @@ class _Descent:
     def refined(self, place: Place, formed: Tensor, draft: Fidelity) -> tuple[Place, bool]:
         """The place with its nuisances refined, and whether other images must be formed for them."""
         setup = self.index.put(place.delta, self.problem.setup)
-        images = place.correction.to(formed)
+        images = place.correction.to(formed, place.delta, self.missed)
         found = refined(self.nuisances, place.parameters, setup, self.problem.misfit, draft, images)
         changed = any(u.forms and not torch.equal(found[u.name], place.parameters[u.name]) for u in self.nuisances)
         return replace(place, parameters=found), changed
@@ -278,9 +283,10 @@ class _Descent:
         """The least index of a volume."""
         return number_of(self.problem.setup.volume.background) + float(delta.min())
 
-    def hessian(self, parameters: dict[str, Tensor], draft: Fidelity) -> WeakHessian:
-        """The weak specimen's Hessian for the directions of a draft. parameters: of the nuisances, by name.
+    def responses(self, parameters: dict[str, Tensor], draft: Fidelity, exact: Fidelity | None) -> WeakHessian:
+        """The weak specimen's Hessian for the directions of a draft; sets what these miss of the careful images.
 
+        parameters: of the nuisances, by name. exact: the careful fidelity; None corrects nothing.
         The misfit's curvature is that at images without noise, nearly: each pixel is the mean of its neighbours.
         """
         values = {u.name: u.value(parameters[u.name]) for u in self.nuisances}
@@ -290,6 +296,9 @@ class _Descent:
         memory = self.problem.fidelity.matrices or draft.memory // 2
         pixels, seen = math.prod(misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
         weights = self.voxels * pixels / seen * curvature  # a camera's pixel stands for the voxels that it sees
+        fewer = exact is not None and draft.sources < exact.sources
+        room = MissedResponse.bytes_for(setup, weights.element_size()) <= memory
+        self.missed = MissedResponse(setup, draft, exact) if exact is not None and fewer and room else None
         return WeakHessian(setup, weights, draft, memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
@@ -327,9 +336,10 @@ class _Descent:
 
     def turned(self, place: Place, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
-        place = replace(place, pairs=(), correction=Correction(), before=None)
+        place = replace(place, pairs=(), correction=Correction(), before=None, responding=place.parameters)
+        hessian = self.responses(place.responding, draft, exact)
         now, place = self.renewed(place, self.formed(place, draft), draft, exact)
-        return replace(place, responding=place.parameters), self.hessian(place.parameters, draft), now
+        return place, hessian, now
 
     def weighted(self, place: Place, now: Judged, number: int) -> Place:
         """The place with the priors' contrast and weight for the next step."""
