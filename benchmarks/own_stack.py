@@ -75,8 +75,8 @@ def journey(seed: int, out: Path, *, bead: bool) -> str:
         if bead:
             values["acquisition"]["prisms"] = by_bead(made, out)
         path = saved(values, out / "typed.toml")
-        ran("calibrate", path, "--out", out / "calibration")
-        ran("reconstruct", out / "calibration" / "calibrated.toml", "--out", out / "volume")
+        ran("calibrate", path, "--out", out / "calibration", "--restart")
+        ran("reconstruct", out / "calibration" / "calibrated.toml", "--out", out / "volume", "--restart")
         seconds = time.process_time() - began
         known = saved(typed(written, tell(recording, Mistakes())), out / "known.toml")
         ran("reconstruct", known, "--out", out / "known")
@@ -117,7 +117,7 @@ def by_bead(made: Drawn, out: Path) -> list[dict[str, Any]]:
     seen = record(specimen, field, recording.microscope, recording.acquisition, recording.faults, seed=1)
     values = typed(new(made, seen, out, "bead"), replace(made.told, background=background, lower=False))
     values["calibration"] = {"bead": {"radius": RADIUS, "index": background + CONTRAST}}
-    ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead")
+    ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead", "--restart")
     found = tomllib.loads((out / "bead" / "calibrated.toml").read_text(encoding="utf-8"))
     return found["acquisition"]["prisms"]
 

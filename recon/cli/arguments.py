@@ -5,6 +5,8 @@ from pathlib import Path
 
 import torch
 
+from recon.config.schema import ConfigError
+from recon.run.folder.prepared import check_folder
 from torchdic import __version__
 
 
@@ -21,13 +23,17 @@ def config(parser: argparse.ArgumentParser) -> None:
 def out(parser: argparse.ArgumentParser) -> None:
     """The folder for the results."""
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder for the results; it is made where it is missing"
+        "--out",
+        type=_folder,
+        required=True,
+        metavar="DIR",
+        help="folder for the results; it is made where it is missing",
     )
 
 
 def out_if_wanted(parser: argparse.ArgumentParser) -> None:
     """A folder for a command that prints its results, and may save them too."""
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to save the plan in, as plan.json")
+    parser.add_argument("--out", type=_folder, metavar="DIR", help="folder to save the plan in, as plan.json")
 
 
 def device(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +53,11 @@ def earlier_run(parser: argparse.ArgumentParser) -> None:
     choice.add_argument("--restart", action="store_true", help="start again and replace the run in DIR")
 
 
+def restart(parser: argparse.ArgumentParser) -> None:
+    """Whether to replace the results that are found in the folder."""
+    parser.add_argument("--restart", action="store_true", help="replace the results in DIR, if there are any")
+
+
 def fit(parser: argparse.ArgumentParser) -> None:
     """Whether reconstructions are measured instead of images."""
     parser.add_argument(
@@ -59,6 +70,15 @@ def fit(parser: argparse.ArgumentParser) -> None:
 def version(parser: argparse.ArgumentParser) -> None:
     """The version of torchdic."""
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}", help="print the version")
+
+
+def _folder(name: str) -> Path:
+    """A folder that can be written to, as far as can be seen before it is made: first of all, not after the work."""
+    try:
+        check_folder(Path(name))
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return Path(name)
 
 
 def _device(name: str) -> torch.device:

@@ -20,7 +20,7 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: missing key data.path: a calibration needs a stack")
     section = config.calibration.bead
     bead = None if section is None else known_bead(section, config.volume.background)
-    calibrate(config, options.out, options.device, bead)
+    calibrate(config, options.out, options.device, bead, restart=options.restart)
 
 
 def known_bead(section: BeadSection, background: float) -> ModelledSpecimen:

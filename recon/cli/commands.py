@@ -14,6 +14,7 @@ from recon.cli.own_stack import new, phase
 from recon.config.schema import AssumedWarning, ConfigError
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
+from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
 from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
@@ -37,12 +38,12 @@ COMMANDS = {
     "demo": Command(
         "simulate a small bead, reconstruct it in three ways and compare each with the truth",
         demo.run,
-        (arguments.out,),
+        (arguments.out, arguments.restart),
     ),
     "simulate": Command(
         "simulate the DIC images of a known specimen",
         simulate.run,
-        (arguments.config, arguments.out, arguments.device),
+        (arguments.config, arguments.out, arguments.device, arguments.restart),
     ),
     "new": Command(
         "write a configuration for a recorded stack, from its file and its images",
@@ -53,7 +54,7 @@ COMMANDS = {
     "phase": Command(
         "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
         phase.run,
-        (phase.arguments,),
+        (phase.arguments, arguments.out, arguments.restart),
     ),
     "plan": Command(
         "find the fastest way to compute images within a tolerance, and which effects matter",
@@ -63,7 +64,7 @@ COMMANDS = {
     "calibrate": Command(
         "find signs, orders and values of the optics, as far as the images of a stack tell them",
         calibrate.run,
-        (arguments.config, arguments.out, arguments.device),
+        (arguments.config, arguments.out, arguments.device, arguments.restart),
     ),
     "reconstruct": Command(
         "find the refractive-index volume behind a stack of DIC images",
@@ -89,7 +90,7 @@ def main(typed: Sequence[str] | None = None) -> int:
     _show_each_warning_once()
     try:
         options.run(options)
-    except (ConfigError, StackError, CheckpointError, ResultsError, WriteError) as error:
+    except (ConfigError, StackError, CheckpointError, FinishedError, ResultsError, WriteError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)

@@ -15,8 +15,9 @@ from recon.run.calibration.by_levels import by_levels
 from recon.run.calibration.by_specimen import by_specimen
 from recon.run.calibration.found import FoundQuantity
 from recon.run.calibration.stack import CalibrationStack
-from recon.run.calibration.written import write_calibration
-from recon.run.reconstruct import prepare_folder
+from recon.run.calibration.written import RESULTS, write_calibration
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 
 # What no image tells, whatever is fitted.
 GAUGES = (
@@ -44,13 +45,23 @@ class Calibration:
     found: tuple[FoundQuantity, ...]
 
 
-def calibrate(config: Config, out: Path, device: torch.device, bead: ModelledSpecimen | None = None) -> Calibration:
+def calibrate(
+    config: Config,
+    out: Path,
+    device: torch.device,
+    bead: ModelledSpecimen | None = None,
+    *,
+    restart: bool = False,
+) -> Calibration:
     """Find what the stack's images tell of the optics, and leave calibrated.toml and calibration.json in a folder.
 
     bead: the one that [calibration] names, where it names one. A line is printed for each quantity, and a table of the
     signs and orders.
-    Raises ConfigError and StackError for bad input, before `out` is touched.
+    restart: replace what an earlier calibration has left there.
+    Raises ConfigError and StackError for bad input, and FinishedError where the folder has a calibration, before `out`
+    is touched.
     """
+    check_no_results(out, RESULTS, restart=restart)
     section = config.calibration.bead
     if (section is None) != (bead is None):
         raise ConfigError("calibration.bead: a bead is fitted where the configuration names one, and only there")

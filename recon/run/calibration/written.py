@@ -12,6 +12,8 @@ from recon.run.calibration.found import FoundQuantity
 from torchdic.files.whole import write_json, write_text
 
 CALIBRATED, CALIBRATION, MICROSCOPE = "calibrated.toml", "calibration.json", "microscope.toml"
+# Of each of them an earlier calibration's would be replaced.
+RESULTS = (CALIBRATION, CALIBRATED, MICROSCOPE)
 
 
 def write_calibration(
