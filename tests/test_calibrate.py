@@ -129,6 +129,48 @@ def test_what_cannot_be_a_bead_is_refused_in_one_line(tmp_path, recorded, monkey
     assert law in said
 
 
+@pytest.mark.parametrize(
+    ("microscope", "section", "law"),
+    [
+        ({}, {"bead": {"radius": 30.0, "index": 1.5}}, "radius: 30 µm is too large for a field of 7.2 µm"),
+        ({"camera": {"pixel_size": 0.1}}, {"bead": {"radius": 3.1, "index": 1.5}}, "3.1 µm is too large for a field"),
+        (
+            {"objective": "none"},
+            {"bead": {"radius": 1.0, "index": 1.5}, "aberrations": [11]},
+            "aberrations: [11] are of an objective, and microscope.objective isn't given",
+        ),
+    ],
+)
+def test_what_no_bead_of_this_field_can_tell_is_refused_before_the_stack_is_read(
+    tmp_path, capsys, microscope, section, law
+):
+    told = {
+        **TOLD,
+        "microscope": TOLD["microscope"] | microscope,
+        "acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)},
+        "calibration": section,
+    }
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert law in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_finished_calibration_is_not_overwritten_unasked(tmp_path, recorded, monkeypatch, capsys):
+    monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None)
+    monkeypatch.setattr("recon.run.calibration.calibrate.by_specimen", lambda stack, _: (stack, []))
+    told = {"acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}}
+    calibrated(tmp_path, recorded, monkeypatch, told)
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    typed = ["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main(typed) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "calibration.json: the folder has results; name another one, or replace them with --restart" in said
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
+    assert main([*typed, "--restart"]) == 0
+
+
 def test_levels_of_one_exposure_tell_the_compensators_zero(tmp_path, recorded, monkeypatch):
     """The pair was recorded at −1.3 and 1.3; told as −1.2 and 1.4 it has a zero of −0.1."""
     monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None)

@@ -12,11 +12,15 @@ from recon.calibration.optics import firsts_of
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.run.calibration.found import FoundQuantity, Value, plain, rounded, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
+from recon.run.data import camera_pixels
 from torchdic import Acquisition
 from torchdic.scalar import number
 
 # Planes of the stack, and µm of light around the bead on each side, that its fit takes.
 PLANES, AROUND = 7, 3.5
+
+# The least size of the field over the bead's.
+ROOM = 1.2
 
 # A fit that leaves more than this many times the noise's misfit, and this share of the contrast, isn't explained.
 POOR, LEAST = 1.5, 0.02
@@ -33,15 +37,9 @@ def by_bead(
 ) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The stack with what its bead tells of the optics, and each quantity.
 
-    Raises ConfigError where the field is no larger than the bead, or the bead isn't found in it.
+    Raises ConfigError where the bead isn't found in the field.
     """
-    config = stack.config
-    pixel, extent = min(stack.pixels.spacing[1:]), min(stack.pixels.extent[1:])
-    if extent < 1.2 * bead.width:
-        raise ConfigError(
-            f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
-            "the images must show the bead and some of the medium around it"
-        )
+    config, pixel = stack.config, min(stack.pixels.spacing[1:])
     part = stack.part(math.ceil((bead.width + 2 * AROUND) / pixel), PLANES)
     model = model_of(part, bead, config.volume.background, config.microscope)
     print(f"the optics behind the bead, by {part.data.shape[0]} × {part.data.shape[1]} of its images …", flush=True)
@@ -50,6 +48,19 @@ def by_bead(
     except ValueError as error:
         raise ConfigError(f"calibration.bead: {error}") from error
     return stack.with_config(_calibrated(config, found)), _quantities(config, found, part.planes)
+
+
+def check_bead(config: Config, section: BeadSection) -> None:
+    """Raise ConfigError where the field is no larger than the bead, or where aberrations are sought of no objective."""
+    extent = min(camera_pixels(config).extent[1:])
+    if extent < ROOM * 2 * section.radius:
+        raise ConfigError(
+            f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
+            "the images must show the bead and some of the medium around it"
+        )
+    terms = list(config.calibration.aberrations)
+    if terms and config.microscope.objective is None:
+        raise ConfigError(f"calibration.aberrations: {terms} are of an objective, and microscope.objective isn't given")
 
 
 def _calibrated(config: Config, found: OpticsFound) -> Config:

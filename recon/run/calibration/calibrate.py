@@ -10,7 +10,7 @@ from recon.calibration.known_specimen import ModelledSpecimen
 from recon.calibration.trials.orders import Orders
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.fit.bounds import Bounds
-from recon.run.calibration.by_bead import by_bead
+from recon.run.calibration.by_bead import by_bead, check_bead
 from recon.run.calibration.by_levels import by_levels
 from recon.run.calibration.by_specimen import by_specimen
 from recon.run.calibration.found import FoundQuantity
@@ -67,6 +67,8 @@ def calibrate(
         raise ConfigError("calibration.bead: a bead is fitted where the configuration names one, and only there")
     if all(prism is None for prism in config.acquisition.prisms):
         raise ConfigError("acquisition.prisms: all images are bright field: there is no shear or bias to calibrate")
+    if section is not None:
+        check_bead(config, section)
     stack = CalibrationStack.read(config, device)
     prepare_folder(out)
     orders = stack.orders(bounds_of(config))
