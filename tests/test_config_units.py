@@ -7,7 +7,7 @@ import tomli_w
 from refusal import the_error
 
 from recon.config import load
-from recon.config.units import wrong_unit
+from recon.config.plausible.impossible import impossible
 
 TEXT = """
 [volume]                       # µm
@@ -162,19 +162,19 @@ def test_a_value_in_another_unit_is_named_with_its_key_and_with_the_value_in_the
     ],
 )
 def test_what_may_be_right_is_allowed(key, value):
-    assert wrong_unit(changed(key, value)) is None
+    assert impossible(changed(key, value)) is None
 
 
 def test_a_low_aperture_is_focused_far_away():
     values = changed("acquisition/focus", [-500, 500])
-    assert wrong_unit(values) is not None
+    assert impossible(values) is not None
     values["microscope"]["objective"]["na"] = 0.1
-    assert wrong_unit(values) is None
+    assert impossible(values) is None
     del values["microscope"]["objective"]  # nothing tells how deep the field is
-    assert wrong_unit(values) is None
+    assert impossible(values) is None
 
 
 @pytest.mark.parametrize("value", [0, -0.546, float("nan"), float("inf"), "546", True, None, [], {}])
 def test_what_breaks_another_law_is_left_to_it(value):
-    assert wrong_unit(changed("microscope/wavelength", value)) is None
-    assert wrong_unit(changed("volume", value)) is None
+    assert impossible(changed("microscope/wavelength", value)) is None
+    assert impossible(changed("volume", value)) is None

@@ -17,6 +17,7 @@ from recon.cli import main
 from recon.cli.own_stack.settled import settle, slices_of
 from recon.config.commented import Line, commented, inline
 from recon.config.reading import load
+from recon.config.schema import UnlikelyWarning
 from recon.recording.survey.direction import ShearDirection
 from recon.recording.survey.survey import SettingSurvey, Survey
 from torchdic import Acquisition, Camera, Condenser, Grid, Microscope, Objective, Prism
@@ -181,6 +182,7 @@ REFUSALS = {
     ("--na", "0"): "--na 0 must be above 0",
     ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
     ("--background", "0.9"): "--background 0.9 must be at least 1",
+    ("--background", "13.6"): "--background: 13.6 is no refractive index of a transparent medium (at most 6); is the",
     ("--bias", "nan"): "--bias nan must be",
     ("--out", "run.txt"): "must end in .toml",
 }
@@ -193,6 +195,16 @@ def test_what_cannot_be_is_one_line_and_leaves_no_file(tmp_path, recording, word
     (line,) = capsys.readouterr().err.splitlines()
     assert REFUSALS[words] in line
     assert not (tmp_path / "run.toml").exists()
+
+
+def test_what_is_unusual_is_remarked_and_written(tmp_path, recording, capsys):
+    words = ("--na", 0.5, "--condenser-na", 1.3, "--background", 2.4)
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", *words) == 0
+    printed = capsys.readouterr().out
+    assert "warning: microscope.condenser.na: 1.3 is above the objective's NA 0.5, which is unusual: DIC" in printed
+    assert "warning: volume.background: 2.4 is likely wrong" in printed
+    with pytest.warns(UnlikelyWarning, match=r"condenser\.na: 1\.3|background: 2\.4"):
+        assert load(tmp_path / "run.toml").volume.background == 2.4
 
 
 def test_a_folder_of_nothing_is_one_line(tmp_path, capsys):

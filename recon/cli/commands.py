@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
 from recon.cli.own_stack import new, phase
-from recon.config.schema import AssumedWarning, ConfigError
+from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
 from recon.run.folder.results import FinishedError
@@ -142,7 +142,7 @@ def _show_each_warning_once() -> None:
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show
-    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning):
+    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning, UnlikelyWarning):
         warnings.simplefilter("always", kind)
 
 

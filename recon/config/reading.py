@@ -14,9 +14,10 @@ from cattrs.errors import ForbiddenExtraKeysError
 from recon.config.conversion import converter
 from recon.config.encoding import decoded
 from recon.config.including import INCLUDE, values_of
-from recon.config.schema import Config, ConfigError, UnitsWarning
+from recon.config.plausible.impossible import impossible
+from recon.config.plausible.unlikely import unlikely
+from recon.config.schema import Config, ConfigError, UnitsWarning, UnlikelyWarning
 from recon.config.spelling import FURTHER, canonical, unknown_key
-from recon.config.units import wrong_unit
 
 T = TypeVar("T")
 
@@ -24,8 +25,9 @@ T = TypeVar("T")
 def load(path: str | os.PathLike[str]) -> Config:
     """Read a configuration file, with those that it includes. A relative path in a file starts from its folder.
 
-    Raises ConfigError where the file can't be used, or where a value can't be in its unit, such as a wavelength of 546
-    µm. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit.
+    Raises ConfigError where the file can't be used, or where a value can't be, such as a wavelength of 546 µm or an
+    index of 13.6. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit, and
+    UnlikelyWarning of other values that are likely wrong.
     """
     path = Path(path)
     try:
@@ -38,6 +40,8 @@ def load(path: str | os.PathLike[str]) -> Config:
     if config.data is not None and not config.data.files:
         raise ConfigError(f"{source}: missing key data.path")
     _warn_of_long_shears(config, path)
+    for line in unlikely(config):
+        warnings.warn(f"{path}: {line}", UnlikelyWarning, stacklevel=2)
     return config
 
 
@@ -55,7 +59,7 @@ def parse(content: bytes, source: str) -> Config:
 
 def _configuration(values: dict[str, Any], source: str) -> Config:
     """The configuration of a file's values. Raises ConfigError as `load` does."""
-    wrong = wrong_unit(values)
+    wrong = impossible(values)
     if wrong is not None:
         raise ConfigError(f"{source}: {wrong}")
     try:

@@ -10,9 +10,10 @@ from typing import Any
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
+from recon.config.plausible.impossible import impossible
+from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
 from recon.config.schema import ConfigError
-from recon.config.units import wrong_unit
 from recon.recording.stuck_pixels import sharpest
 from recon.recording.survey.survey import Survey, survey
 from torchdic import Microscope, Objective
@@ -34,9 +35,10 @@ OPTIONS = {
 }
 
 
-# Where a configuration holds a length, whose unit is checked there.
+# Where a configuration holds a value, whose size is checked there.
 _AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
     "wavelength": lambda value: {"microscope": {"wavelength": value}},
+    "background": lambda value: {"volume": {"background": value}},
     "pixel_size": lambda value: {"volume": {"pixel_size": value}},
     "z_step": lambda value: {"volume": {"slice_thickness": value}},
     "shear": lambda value: {"acquisition": {"prisms": [{"shear": {"length": value}}]}},
@@ -74,13 +76,13 @@ def run(options: argparse.Namespace) -> None:
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
     path = _from(options.out, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
-    parse(text.encode(), str(options.out))  # what the user gave may break a law
+    config = parse(text.encode(), str(options.out))  # what the user gave may break a law
     options.out.parent.mkdir(parents=True, exist_ok=True)
     if joined is not None:
         _join(gathered, settled, joined)
     write_text(options.out, text)
     print(summary(options.out, gathered, found, settled))
-    for line in warnings_of(gathered, found, settled):
+    for line in (*warnings_of(gathered, found, settled), *(f"warning: {line}" for line in unlikely(config))):
         print(f"  {line}")
     print(
         f"\nCorrect what is assumed in {options.out}. Then torchdic calibrate {options.out} --out DIR finds what the "
@@ -97,7 +99,7 @@ def check_given(given: Mapping[str, float | None]) -> None:
         least = 1.0 if name == "background" else 0.0
         if not (value >= least and 0 < value < math.inf):
             raise ConfigError(f"{option} {value:g} must be {'at least 1' if least else 'above 0'}, and finite")
-        wrong = wrong_unit(_AS_KEYS[name](value)) if name in _AS_KEYS else None
+        wrong = impossible(_AS_KEYS[name](value)) if name in _AS_KEYS else None
         if wrong is not None:
             raise ConfigError(f"{option}: {wrong.partition(': ')[2]}")
 
