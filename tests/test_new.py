@@ -175,6 +175,31 @@ def test_nothing_is_overwritten(tmp_path, recording, capsys):
     assert (tmp_path / "run.toml").read_text() == "mine"
 
 
+@pytest.mark.parametrize("named", ["folder", "files"])
+def test_all_that_would_be_overwritten_is_said_at_once(tmp_path, recording, capsys, named):
+    folder, out = written(recording, tmp_path, "folder"), tmp_path / "run.toml"
+    stacks = [folder] if named == "folder" else sorted(folder.glob("*.tif"))
+    joined = tmp_path / "run.stack.ome.tif"
+    joined.write_text("mine")
+    assert new(*stacks, "--out", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{joined}: is there already, and isn't overwritten; choose another name or remove it" in line
+    out.write_text("mine")
+    assert new(*stacks, "--out", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{out} and {joined}: are there already, and aren't overwritten" in line
+    # of one file no stack is joined
+    assert new(written(recording, tmp_path), "--out", out) == 2
+    assert f"error: {out}: is there already" in capsys.readouterr().err
+    assert out.read_text() == joined.read_text() == "mine"
+
+
+def test_a_configuration_below_a_file_is_refused_before_the_stack_is_read(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert new(tmp_path / "missing.tif", "--out", tmp_path / "file" / "run.toml") == 2
+    assert "file is a file, not a folder" in capsys.readouterr().err
+
+
 REFUSALS = {
     ("--wavelength", "546"): "546 µm is no wavelength of light (0.01 to 20 µm); lengths are in µm: 546 nm are 0.546 µm",
     ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",

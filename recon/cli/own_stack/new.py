@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
@@ -62,17 +63,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write a configuration for a stack and print what is in it, and what is assumed."""
-    if options.out.exists():
-        raise ConfigError(f"{options.out}: is there already, and isn't overwritten; choose another name or remove it")
-    if options.out.suffix.lower() != ".toml":
-        raise ConfigError(f"{options.out}: the configuration's name must end in .toml")
+    check_out(options.out, options.stack)
     gathered = gather(options.stack, options.series)
     given = {name.replace("-", "_"): getattr(options, name.replace("-", "_")) for name in OPTIONS}
     check_given(given)
     found, settled = look(gathered, {**given, "lower": options.lower})
-    joined = None if gathered.one_file else options.out.with_name(f"{options.out.stem}.stack.ome.tif")
-    if joined is not None and joined.exists():
-        raise ConfigError(f"{joined}: is there already, and isn't overwritten; choose another name for {options.out}")
+    joined = None if gathered.one_file else joined_beside(options.out)
+    if joined is not None:
+        check_not_there([joined])
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
     path = _from(options.out, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
