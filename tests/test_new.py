@@ -113,6 +113,7 @@ def test_options_fill_in_what_the_file_lacks(tmp_path, recording):
         "background": 1.34,
         "shear": 0.25,
         "bias": 80,
+        "offset": 60,
     }
     words = [word for name, value in options.items() for word in (f"--{name}", value)]
     assert new(written(recording, tmp_path, "tiff"), "--out", tmp_path / "run.toml", *words) == 0
@@ -121,10 +122,40 @@ def test_options_fill_in_what_the_file_lacks(tmp_path, recording):
     assert config.microscope.condenser is not None
     assert (config.microscope.wavelength, config.microscope.condenser.na) == (0.546, 0.6)
     assert config.volume.background == 1.34
+    assert config.data is not None
+    assert config.data.offset == 60
     (first, _), shear = config.acquisition.prisms, 0.25
     assert first is not None
     assert math.hypot(*map(float, first.shear)) == pytest.approx(shear)
     assert float(first.bias) == pytest.approx(math.radians(80))
+
+
+def test_every_value_that_is_assumed_is_named_as_assumed(tmp_path, recording):
+    """In run.toml's comments, by the quantity that they are of."""
+    assert new(written(recording, tmp_path, "tiff"), "--out", tmp_path / "run.toml") == 0
+    text, config = (tmp_path / "run.toml").read_text(), load(tmp_path / "run.toml")
+    names = {
+        "length assumed": "shear's length",
+        "bias assumed": "bias",
+        "step assumed": "focus step",
+        "assumed: the first plane": "order of the planes",
+        "objective =": "objective's NA",
+        "condenser =": "condenser's NA",
+        "wavelength =": "wavelength",
+        "background =": "medium's index",
+        "pixel_size =": "pixel size",
+        "offset =": "camera's offset",
+        "bounds =": "sign of Δn",
+    }
+    found = {name for line in values(text) if "assumed" in line for words, name in names.items() if words in line}
+    assert set(config.assumed) == found
+    assert "camera's offset" in found
+
+
+def test_floats_have_no_dark_counts_to_be_assumed(tmp_path, recording):
+    write_stack(tmp_path / "f.tif", recording.data.astype(np.float32) / 900, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "f.tif", "--out", tmp_path / "run.toml") == 0
+    assert "camera's offset" not in load(tmp_path / "run.toml").assumed
 
 
 def test_a_lower_index_turns_the_shear_and_the_bounds(tmp_path, recording):
@@ -208,6 +239,7 @@ REFUSALS = {
     ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
     ("--background", "0.9"): "--background 0.9 must be at least 1",
     ("--background", "13.6"): "--background: 13.6 is no refractive index of a transparent medium (at most 6); is the",
+    ("--offset", "-1"): "--offset -1 must be at least 0, and finite",
     ("--bias", "nan"): "--bias nan must be",
     ("--out", "run.txt"): "must end in .toml",
 }

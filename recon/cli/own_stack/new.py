@@ -33,6 +33,7 @@ OPTIONS = {
     "shear": "length of the shear, µm",
     "shear-angle": "direction of the shear in degrees, from right towards down",
     "bias": "phase between the beams in degrees",
+    "offset": "counts of a dark image",
 }
 
 
@@ -44,6 +45,9 @@ _AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
     "z_step": lambda value: {"volume": {"slice_thickness": value}},
     "shear": lambda value: {"acquisition": {"prisms": [{"shear": {"length": value}}]}},
 }
+
+# The least values of options that need not be above 0.
+_LEAST = {"background": 1.0, "offset": 0.0}
 
 # A pixel in µm, of which no spot of light fills one alone.
 SMALL = 0.05
@@ -88,15 +92,19 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
+def _above(least: float | None) -> str:
+    return "above 0" if least is None else f"at least {least:g}"
+
+
 def check_given(given: Mapping[str, float | None]) -> None:
     """Raise ConfigError for an option that breaks its law, or that can't be in its unit."""
     for name, value in given.items():
         option = f"--{name.replace('_', '-')}"
         if value is None or (math.isfinite(value) and name in ("bias", "shear_angle")):
             continue
-        least = 1.0 if name == "background" else 0.0
-        if not (value >= least and 0 < value < math.inf):
-            raise ConfigError(f"{option} {value:g} must be {'at least 1' if least else 'above 0'}, and finite")
+        least = _LEAST.get(name)
+        if not ((value > 0 if least is None else value >= least) and value < math.inf):
+            raise ConfigError(f"{option} {value:g} must be {_above(least)}, and finite")
         wrong = impossible(_AS_KEYS[name](value)) if name in _AS_KEYS else None
         if wrong is not None:
             raise ConfigError(f"{option}: {wrong.partition(': ')[2]}")

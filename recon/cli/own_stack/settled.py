@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from recon.config.commented import Sourced
+from recon.recording.survey.dark_counts import DarkCounts
 from recon.recording.survey.survey import SettingSurvey, Survey
+from torchdic.files.format import Stack
 from torchdic.files.gathered import Gathered
 
 # Values that nobody has said: green light, a dry objective of high aperture, a watery medium, a quarter wave of bias.
@@ -30,7 +32,8 @@ class Settled:
     """All values of a configuration, each with its origin.
 
     prisms: (length, angle in degrees, bias in degrees) of each setting. slices: of the volume, (number, spacing in µm).
-    first: depth of the first plane in µm. lower: whether the specimen's index is below its medium's.
+    first: depth of the first plane in µm. offset: counts in the dark; None where the images are no counts.
+    lower: whether the specimen's index is below its medium's.
     """
 
     pixel_size: Sourced
@@ -42,6 +45,7 @@ class Settled:
     prisms: tuple[tuple[Sourced, Sourced, Sourced], ...]
     slices: tuple[int, float]
     first: float
+    offset: Sourced | None
     lower: bool
 
     @property
@@ -50,8 +54,8 @@ class Settled:
         angles = [angle for _, angle, _ in self.prisms]
         lengths, biases = [length for length, _, _ in self.prisms], [bias for _, _, bias in self.prisms]
         all_of_them = (*lengths, *angles, *biases, self.na, self.condenser_na, self.background, self.wavelength)
-        steps = [self.step] if self.first else []
-        named = [one.name for one in (*all_of_them, self.pixel_size, *steps) if one.origin == "assumed"]
+        steps, offsets = [self.step] if self.first else [], [] if self.offset is None else [self.offset]
+        named = [one.name for one in (*all_of_them, *offsets, self.pixel_size, *steps) if one.origin == "assumed"]
         others = [*(["order of the planes"] if self.first else []), *([] if self.lower else ["sign of Δn"])]
         return list(dict.fromkeys([*named, *others]))
 
@@ -89,6 +93,7 @@ def settle(gathered: Gathered, found: Survey, given: Mapping[str, float | None])
         prisms=_prisms(found, given, round(wavelength.value / (2 * reach), 2)),
         slices=slices_of(planes, step.value, depth, pixel.value),
         first=round(-(planes - 1) / 2 * step.value, 6),
+        offset=_offset(stack, found.camera, given.get("offset")),
         lower=bool(given.get("lower")),
     )
 
@@ -119,6 +124,19 @@ def _chosen(given: float | None, said: float | None, guess: float, name: str, wh
     if said is not None:
         return Sourced(float(f"{said:.6g}"), "file", name=name)
     return Sourced(guess, "assumed", why, name)
+
+
+def _offset(stack: Stack, camera: DarkCounts | None, given: float | None) -> Sourced | None:
+    """The counts of a dark image."""
+    name = "camera's offset"
+    if given is not None:
+        return Sourced(float(given), "given", "counts in the dark", name)
+    if not stack.is_integer:
+        return None
+    if camera is not None and camera.offset_is_seen:
+        why = f"± {camera.offset_error:.0f}, from how noise grows with light; counts in the dark"
+        return Sourced(float(round(camera.offset)), "measured", why, name)
+    return Sourced(0.0, "assumed", "the counts of a dark image, which these images don't show", name)
 
 
 def _prisms(

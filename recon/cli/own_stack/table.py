@@ -62,6 +62,8 @@ def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[R
     if stack.is_integer:
         bits = stack.bits or 8 * stack.data.dtype.itemsize
         yield "camera", f"{bits} bits", "file" if stack.bits else "file (of its pixels)"
+    if settled.offset is not None:
+        yield "camera's offset", f"{settled.offset.value:g}{unit}", settled.offset.origin
     levels, noises = [s.level for s in found.settings], [s.noise for s in found.settings if s.noise is not None]
     yield "background", f"{_range(levels)}{unit}", "measured"
     uneven = max(setting.unevenness for setting in found.settings)
