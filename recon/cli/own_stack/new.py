@@ -2,7 +2,6 @@
 
 import argparse
 import math
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
+from recon.config.including import seen_from
 from recon.config.plausible.impossible import impossible
 from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
     if joined is not None:
         check_not_there([joined])
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
-    path = _from(options.out, data if joined is None else joined)
+    path = seen_from(options.out.parent, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
     config = parse(text.encode(), str(options.out))  # what the user gave may break a law
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -121,15 +121,6 @@ def look(gathered: Gathered, given: dict[str, float | None]) -> tuple[Survey, Se
     size = (side, side) if side else pixel or (SMALL, SMALL)
     found = survey(gathered.stack, sharpest(microscope, size, background))
     return found, settle(gathered, found, given)
-
-
-def _from(configuration: Path, file: Path) -> str:
-    """A file's path as the configuration names it: from its folder where that is shorter."""
-    try:
-        relative = os.path.relpath(file.resolve(), configuration.resolve().parent)
-    except ValueError:  # another drive
-        return str(file.resolve())
-    return Path(relative).as_posix()
 
 
 def _join(gathered: Gathered, settled: Settled, path: Path) -> None:

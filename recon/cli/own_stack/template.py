@@ -40,6 +40,10 @@ def _line(key: str, value: Sourced) -> Line:
     return Line(key, value.value, value.comment)
 
 
+def _short(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
 def _acquisition(gathered: Gathered, found: Survey, settled: Settled) -> list[Line]:
     """Prisms and focus planes; only the user knows most of them."""
     names = gathered.stack.names
@@ -98,8 +102,8 @@ def _data(gathered: Gathered, found: Survey, settled: Settled, path: str, series
         return lines
     if camera is not None:
         sure = f"measured: ± {camera.gain_error / camera.gain:.0%}, counts per electron"
-        lines.append(Line("gain", camera.gain, sure))
-        lines.append(Line("read_noise", camera.read, "chosen: 2 electrons in counts, as is usual"))
+        lines.append(Line("gain", _short(camera.gain), sure))
+        lines.append(Line("read_noise", _short(camera.read), "chosen: 2 electrons in counts, as is usual"))
     return lines
 
 

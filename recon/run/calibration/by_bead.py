@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
 from recon.calibration.optics import firsts_of
 from recon.config.schema import BeadSection, Config, ConfigError
-from recon.run.calibration.found import FoundQuantity, Value, plain, rounded, rounded_shear
+from recon.run.calibration.found import DIRECTION, FoundQuantity, Value, plain, rounded, rounded_angle, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
 from recon.run.data import camera_pixels
 from torchdic import Acquisition
@@ -67,7 +67,7 @@ def _calibrated(config: Config, found: OpticsFound) -> Config:
     """The configuration with the optics that were found."""
     acquisition, microscope = found.setup.acquisition, found.setup.microscope
     prisms = [
-        None if prism is None else replace(rounded_shear(prism), bias=rounded(prism.bias, 5))
+        None if prism is None else replace(rounded_shear(prism), bias=rounded_angle(prism.bias))
         for prism in acquisition.prisms
     ]
     condenser, objective = config.microscope.condenser, config.microscope.objective
@@ -137,10 +137,10 @@ def _shears(config: Config, found: OpticsFound, how: str) -> list[FoundQuantity]
     deviations = found.deviations["shear"]
     lengths, angles = ([rounded(value, 5) for value in values] for values in zip(*now, strict=True))
     sure = plain(torch.tensor(lengths) * deviations[:, 0].cpu(), 2)
-    note = f"{how}; from +x towards +y (down)"
+    note = f"{how}; from right towards down"
     return [
         FoundQuantity("shear's length", "µm", [length for length, _ in told], lengths, sure, how),
-        FoundQuantity("shear's angle", "rad", [a for _, a in told], angles, plain(deviations[:, 1], 2), note),
+        FoundQuantity(DIRECTION, "rad", [a for _, a in told], angles, plain(deviations[:, 1], 2), note),
     ]
 
 
