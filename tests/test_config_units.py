@@ -80,6 +80,22 @@ def test_half_a_character_of_utf_16_is_told(put):
     assert "save the file as UTF-8" in message
 
 
+@pytest.mark.parametrize(
+    ("point", "comma"), [("wavelength = 0.546", "wavelength = 0,546"), ("{ na = 0.9 }", "{ na = 0,9 }")]
+)
+def test_a_decimal_comma_is_told_with_its_line(put, point, comma):
+    assert point in TEXT
+    message = the_error(put(TEXT.replace(point, comma).encode()))
+    wrong = comma.strip("{ }").rpartition(" ")[2]
+    line = TEXT[: TEXT.index(point)].count("\n") + 1
+    assert message == f"is not TOML: {wrong} in line {line} has a decimal comma: write {wrong.replace(',', '.')}"
+
+
+def test_another_fault_is_not_put_down_to_a_comma(put):
+    text = TEXT.replace("[volume]", "[volume")
+    assert "decimal comma" not in the_error(put(text.encode()))
+
+
 # --- units ------------------------------------------------------------------------------------------------------------
 
 SPECIMEN = {"kind": "bead", "radius": 2.5, "contrast": 0.03}

@@ -1,6 +1,8 @@
 """The arguments that commands share: each function here adds one to a command's parser."""
 
 import argparse
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -8,6 +10,9 @@ import torch
 from recon.config.schema import ConfigError
 from recon.run.folder.prepared import check_folder
 from torchdic import __version__
+
+# A word that is meant as a number.
+_NUMBER = re.compile(r"[+-]?[\d.,]+(e[+-]?\d+)?")
 
 
 def config(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +70,37 @@ def fit(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="measure reconstructions instead of images: error of the volume, or misfit over noise of a measured stack",
     )
+
+
+def decimal(text: str) -> float:
+    """A number as a word of the command line. Raises ArgumentTypeError, which offers a decimal point for a comma."""
+    try:
+        return float(text)
+    except ValueError:
+        if re.fullmatch(r"[+-]?\d*,\d+", text):
+            point = text.replace(",", ".")
+            raise argparse.ArgumentTypeError(f"{text} has a decimal comma: write {point}") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+
+
+def repeated(words: Sequence[str], several: Sequence[str]) -> list[str]:
+    """The words of a command, where an option of several numbers stands before each of them.
+
+    several: such options. argparse by itself would take the name of a stack that follows them for one more number.
+    """
+    told: list[str] = []
+    option, numbers = "", 0
+    for word in words:
+        name, _, value = word.partition("=")
+        if name in several:
+            option, numbers = name, int(bool(value))
+        elif option and _NUMBER.fullmatch(word) and not Path(word).exists():
+            told += [option] if numbers else []
+            numbers += 1
+        else:
+            option = ""
+        told.append(word)
+    return told
 
 
 def version(parser: argparse.ArgumentParser) -> None:

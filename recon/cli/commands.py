@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
 from recon.cli.own_stack import new, phase
+from recon.cli.own_stack.options import SEVERAL
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
@@ -26,12 +27,16 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names."""
+    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names.
+
+    several: its options that take several numbers.
+    """
 
     help: str
     run: Callable[[argparse.Namespace], None]
     arguments: tuple[Callable[[argparse.ArgumentParser], None], ...]
     aliases: tuple[str, ...] = ()
+    several: tuple[str, ...] = ()
 
 
 COMMANDS = {
@@ -50,6 +55,7 @@ COMMANDS = {
         new.run,
         (new.arguments,),
         ("init",),
+        several=SEVERAL,
     ),
     "phase": Command(
         "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
@@ -86,7 +92,10 @@ def main(typed: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
     """
     write_plainly()
-    options = _parser().parse_args(typed)
+    words = list(sys.argv[1:] if typed is None else typed)
+    rows = [row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)]
+    several = rows[0].several if rows else ()
+    options = _parser().parse_args(arguments.repeated(words, several))
     _show_each_warning_once()
     try:
         options.run(options)

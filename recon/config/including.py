@@ -4,12 +4,11 @@ A microscope is described once and used for many specimens: `include = "microsco
 """
 
 import os
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from recon.config.encoding import decoded
+from recon.config.encoding import values_in
 from recon.config.spelling import ALTERNATIVES
 
 INCLUDE = "include"
@@ -43,11 +42,9 @@ def values_of(path: Path) -> tuple[Table, list[Path]]:
 def _values(path: Path, above: tuple[Path, ...], found: list[Path]) -> Table:
     """above: the files by which this one is included, outermost first. found: grows by those that it includes."""
     try:
-        values = tomllib.loads(decoded(path.read_bytes()))
+        values = values_in(path.read_bytes())
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
-    except ValueError as error:  # TOMLDecodeError is one
-        raise ValueError(f"is not TOML: {error}") from error
     values = _from_folder(values, path.parent)
     chain, beneath = (*above, path.resolve()), {}
     for name in _names(values.pop(INCLUDE, [])):

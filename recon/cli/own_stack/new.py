@@ -1,53 +1,22 @@
 """torchdic new: a configuration from a recorded stack, in which every value says where it comes from."""
 
 import argparse
-import math
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
+from recon.cli.own_stack.options import Given, add_options, given_of, in_radians
 from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
 from recon.config.including import seen_from
-from recon.config.plausible.impossible import impossible
 from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
-from recon.config.schema import ConfigError
 from recon.recording.stuck_pixels import sharpest
 from recon.recording.survey.survey import Survey, survey
 from torchdic import Microscope, Objective
 from torchdic.files.gathered import Gathered, gather
 from torchdic.files.stack import write_stack
 from torchdic.files.whole import write_text
-
-# Options in µm, degrees or without unit, each with its help.
-OPTIONS = {
-    "pixel-size": "side of a camera's pixel in the specimen, µm",
-    "z-step": "distance between focus planes, µm",
-    "wavelength": "of the light in vacuum, µm",
-    "na": "numerical aperture of the objective",
-    "condenser-na": "numerical aperture of the condenser, as far as it is open",
-    "background": "refractive index of the medium around the specimen",
-    "shear": "length of the shear, µm",
-    "shear-angle": "direction of the shear in degrees, from right towards down",
-    "bias": "phase between the beams in degrees",
-    "offset": "counts of a dark image",
-}
-
-
-# Where a configuration holds a value, whose size is checked there.
-_AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
-    "wavelength": lambda value: {"microscope": {"wavelength": value}},
-    "background": lambda value: {"volume": {"background": value}},
-    "pixel_size": lambda value: {"volume": {"pixel_size": value}},
-    "z_step": lambda value: {"volume": {"slice_thickness": value}},
-    "shear": lambda value: {"acquisition": {"prisms": [{"shear": {"length": value}}]}},
-}
-
-# The least values of options that need not be above 0.
-_LEAST = {"background": 1.0, "offset": 0.0}
 
 # A pixel in µm, of which no spot of light fills one alone.
 SMALL = 0.05
@@ -60,17 +29,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="RUN.toml", help="configuration file to write")
     parser.add_argument("--series", type=int, metavar="N", help="which of several stacks in the file, counted from 0")
-    for name, words in OPTIONS.items():
-        parser.add_argument(f"--{name}", type=float, metavar="X", help=words)
+    add_options(parser)
     parser.add_argument("--lower", action="store_true", help="the specimen's index is below its medium's")
 
 
 def run(options: argparse.Namespace) -> None:
     """Write a configuration for a stack and print what is in it, and what is assumed."""
     check_out(options.out, options.stack)
+    given = given_of(options)
     gathered = gather(options.stack, options.series)
-    given = {name.replace("-", "_"): getattr(options, name.replace("-", "_")) for name in OPTIONS}
-    check_given(given)
     found, settled = look(gathered, {**given, "lower": options.lower})
     joined = None if gathered.one_file else joined_beside(options.out)
     if joined is not None:
@@ -84,7 +51,8 @@ def run(options: argparse.Namespace) -> None:
         _join(gathered, settled, joined)
     write_text(options.out, text)
     print(summary(options.out, gathered, found, settled))
-    for line in (*warnings_of(gathered, found, settled), *(f"warning: {line}" for line in unlikely(config))):
+    likely_wrong = [*in_radians(given), *(f"warning: {line}" for line in unlikely(config))]
+    for line in (*warnings_of(gathered, found, settled), *likely_wrong):
         print(f"  {line}")
     print(
         f"\nCorrect what is assumed in {options.out}. Then torchdic calibrate {options.out} --out DIR finds what the "
@@ -92,25 +60,7 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
-def _above(least: float | None) -> str:
-    return "above 0" if least is None else f"at least {least:g}"
-
-
-def check_given(given: Mapping[str, float | None]) -> None:
-    """Raise ConfigError for an option that breaks its law, or that can't be in its unit."""
-    for name, value in given.items():
-        option = f"--{name.replace('_', '-')}"
-        if value is None or (math.isfinite(value) and name in ("bias", "shear_angle")):
-            continue
-        least = _LEAST.get(name)
-        if not ((value > 0 if least is None else value >= least) and value < math.inf):
-            raise ConfigError(f"{option} {value:g} must be {_above(least)}, and finite")
-        wrong = impossible(_AS_KEYS[name](value)) if name in _AS_KEYS else None
-        if wrong is not None:
-            raise ConfigError(f"{option}: {wrong.partition(': ')[2]}")
-
-
-def look(gathered: Gathered, given: dict[str, float | None]) -> tuple[Survey, Settled]:
+def look(gathered: Gathered, given: Given) -> tuple[Survey, Settled]:
     """What the images tell, and the values of a configuration."""
     said, pixel = gathered.setup, gathered.stack.pixel_size
     microscope = Microscope(

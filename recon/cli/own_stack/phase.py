@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from recon.cli.arguments import decimal
 from recon.cli.own_stack.phase_figure import draw_phase
 from recon.config.schema import ConfigError
 from recon.earlier.one_image import phase_of_image
@@ -44,7 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--series", type=int, metavar="N", help="which of several stacks in the file, counted from 0")
     parser.add_argument("--setting", type=int, default=1, metavar="N", help="prism setting, counted from 1")
     parser.add_argument("--plane", type=int, metavar="N", help="focus plane, counted from 1; the sharpest without it")
-    parser.add_argument("--shear-angle", type=float, metavar="X", help="degrees, from right towards down")
+    parser.add_argument("--shear-angle", type=decimal, metavar="X", help="degrees, from right towards down")
 
 
 def run(options: argparse.Namespace) -> None:

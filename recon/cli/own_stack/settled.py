@@ -4,8 +4,10 @@ import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from recon.config.commented import Sourced
+from recon.config.schema import ConfigError
 from recon.recording.survey.dark_counts import DarkCounts
 from recon.recording.survey.survey import SettingSurvey, Survey
 from torchdic.files.format import Stack
@@ -13,6 +15,8 @@ from torchdic.files.gathered import Gathered
 
 # Values that nobody has said: green light, a dry objective of high aperture, a watery medium, a quarter wave of bias.
 WAVELENGTH, NA, BACKGROUND, _BIAS_DEGREES, _ANGLE_DEGREES = 0.55, 0.9, 1.335, 90.0, 45.0
+
+ANGLE = "shear's angle"
 
 # Slices are no thicker than this many µm: light bends within them.
 _THICKEST = 1.0
@@ -60,7 +64,7 @@ class Settled:
         return list(dict.fromkeys([*named, *others]))
 
 
-def settle(gathered: Gathered, found: Survey, given: Mapping[str, float | None]) -> Settled:
+def settle(gathered: Gathered, found: Survey, given: Mapping[str, Any]) -> Settled:
     """Choose each value.
 
     given: by the user, under the names of the command's options; None or missing is not given.
@@ -139,9 +143,7 @@ def _offset(stack: Stack, camera: DarkCounts | None, given: float | None) -> Sou
     return Sourced(0.0, "assumed", "the counts of a dark image, which these images don't show", name)
 
 
-def _prisms(
-    found: Survey, given: Mapping[str, float | None], usual: float
-) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
+def _prisms(found: Survey, given: Mapping[str, Any], usual: float) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
     """Length, angle and bias of each setting's shear; the first bias along an axis is taken as above 0.
 
     A setting much darker than the brightest has bias 0, and the axis of the one before it: its images don't show any.
@@ -156,11 +158,44 @@ def _prisms(
             places.append((places[-1][0] if places else 0, 0.0))
         else:
             places.append(_place(setting, axes, places))
-    lower, told = bool(given.get("lower")), given.get("shear_angle")
-    angles = [_angle(axis, None if number else told, lower=lower) for number, axis in enumerate(axes)]
+    shown = [_angle(axis, lower=bool(given.get("lower"))) for axis in axes]
+    told = _told_angles(given.get("shear_angle") or (), places, len(axes))
+    angles = [shown[axis] if angle is None else angle for (axis, _), angle in zip(places, told, strict=True)]
+    places = _as_told(places, told)
     dark = replace(size, value=0.0, origin="measured", why="its empty field is dark beside another setting's")
     biases = [replace(size, value=sign * size.value) if sign else dark for _, sign in places]
-    return tuple((length, angles[axis], bias) for (axis, _), bias in zip(places, biases, strict=True))
+    return tuple((length, angle, bias) for angle, bias in zip(angles, biases, strict=True))
+
+
+def _told_angles(told: Sequence[float], places: Sequence[tuple[int, float]], axes: int) -> list[Sourced | None]:
+    """The angle of each setting as far as the user gave it: one for each axis, or one for each setting.
+
+    A single one is of the first axis. places: number of the axis, and sign of the bias, of each setting. axes: how many
+    there are. Raises ConfigError for another number of angles.
+    """
+    if len(told) == axes or len(told) <= 1:
+        given = [told[axis] if axis < len(told) else None for axis, _ in places]
+    elif len(told) == len(places):
+        given = list(told)
+    else:
+        counts = f"{axes} axes of shear" if axes > 1 else "one axis of shear"
+        raise ConfigError(
+            f"--shear-angle {' '.join(f'{angle:g}' for angle in told)}: {len(told)} angles, and the images show "
+            f"{counts} in {len(places)} prism settings: give one for each axis, or one for each setting"
+        )
+    return [None if angle is None else Sourced(float(angle), "given", name=ANGLE) for angle in given]
+
+
+def _as_told(places: Sequence[tuple[int, float]], told: Sequence[Sourced | None]) -> list[tuple[int, float]]:
+    """The settings' axes and signs of bias; of those on one axis whose angles are given reversed the signs are, too."""
+    first: dict[int, float] = {}
+    turned = []
+    for (axis, sign), angle in zip(places, told, strict=True):
+        if angle is not None:
+            apart = math.radians(angle.value - first.setdefault(axis, angle.value))
+            sign = sign if math.cos(apart) >= 0 else -sign
+        turned.append((axis, sign))
+    return turned
 
 
 @dataclass
@@ -212,16 +247,13 @@ def _likely(setting: SettingSurvey, places: Sequence[tuple[int, float]]) -> tupl
     return max(others)[1:]
 
 
-def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
+def _angle(axis: _Axis, *, lower: bool) -> Sourced:
     """The angle of an axis in degrees, from what its settings show together.
 
     Its uncertainty is that of their weighted mean, or half of how far they are apart where that is more.
     """
-    name = "shear's angle"
-    if told is not None:
-        return Sourced(float(told), "given", name=name)
     if not axis.shown:
-        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", name)
+        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", ANGLE)
     mean = sum(axis.shown)
     beside = max(abs(math.degrees(cmath.phase(one / mean))) for one in axis.shown)
     sure = max(math.degrees(1 / math.sqrt(sum(map(abs, axis.shown)))), beside / 2)
@@ -230,4 +262,4 @@ def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
         why = f"± {sure:.0f}°, if Δn is {'below' if lower else 'above'} 0 and the bias between 0° and 180°"
     else:
         why = f"± {sure:.0f}°, or the opposite: the images don't show which"
-    return Sourced(round(degrees % 360, 1), "measured", why, name)
+    return Sourced(round(degrees % 360, 1), "measured", why, ANGLE)

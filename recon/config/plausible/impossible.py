@@ -86,6 +86,7 @@ _QUANTITIES = (
     ),
     _Plausible(r"volume\.(spacing|slice_thickness)", "size of a voxel", 1e-3, 100, each=True),
     _Plausible(r"microscope\.camera\.pixel_size", "size of a pixel", 1e-3, 100),
+    _Plausible("z_step", "distance between focus planes", 1e-3, 100),  # an option of `torchdic new`
     _Plausible(rf"{_PRISM}shear(\.length)?", "shear", 1e-4, 20),
     _Plausible(rf"{_PRISM}({'|'.join(ANGLES)}|shear\.angle){DEGREES}", "angle of at most a turn", 0, 360, "°"),
     _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
@@ -135,7 +136,7 @@ def impossible(values: dict[str, Any]) -> str | None:
 
     values: of a configuration file, as TOML holds them. Values of a wrong type are passed over.
     """
-    known = dict(_numbers(values))
+    known = dict(numbers_in(values))
     quantities = (*_QUANTITIES, _focus(known), *_of_the_specimen(known))
     for key, numbers in known.items():
         if key in ("volume.spacing", "volume.pixel_size"):
@@ -173,14 +174,14 @@ def _extent(known: dict[str, dict[str, float]]) -> list[float]:
     return [n * d for n, d in zip(shape, sides, strict=True)] if len(shape) == len(sides) == 3 else []
 
 
-def _numbers(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:
+def numbers_in(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:
     """Each key with its number, or with the numbers of its array by their place in it."""
     if isinstance(value, dict):
         for name, below in value.items():
-            yield from _numbers(below, f"{key}.{name}" if key else name)
+            yield from numbers_in(below, f"{key}.{name}" if key else name)
     elif isinstance(value, list) and any(isinstance(below, dict) for below in value):
         for index, below in enumerate(value):
-            yield from _numbers(below, f"{key}[{index}]")
+            yield from numbers_in(below, f"{key}[{index}]")
     else:
         array = {f"[{i}]": below for i, below in enumerate(value)} if isinstance(value, list) else {"": value}
         found = {place: float(number) for place, number in array.items() if _is_finite_number(number)}

@@ -2,8 +2,11 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
+from recon.config.plausible.impossible import numbers_in
 from recon.config.schema import Config
+from recon.config.spelling import DEGREES
 from torchdic.scalar import number
 
 # Light of DIC in µm. From INFRARED on, silicon and germanium are media.
@@ -23,6 +26,35 @@ _PIXEL, _SHEAR = (1 / 15, 4.0), 4.0
 
 # The greatest |Δn| of what light passes without much loss: of air against glass, with room to spare.
 _DIFFERENCE = 1.0
+
+
+# Angles in degrees that are known by their multiple of π, and how near a number comes that was meant so.
+_MULTIPLES = {
+    15.0: "π/12", 22.5: "π/8", 30.0: "π/6", 45.0: "π/4", 60.0: "π/3", 67.5: "3π/8", 90.0: "π/2", 120.0: "2π/3",
+    135.0: "3π/4", 150.0: "5π/6", 180.0: "π", 270.0: "3π/2", 360.0: "2π",
+}  # fmt: skip
+_NEAR = 2e-3
+
+
+def like_radians(angle: float) -> tuple[str, float] | None:
+    """The multiple of π in rad that an angle looks like, in words and in degrees; None where it looks like none."""
+    for degrees, words in _MULTIPLES.items():
+        if abs(abs(angle) - math.radians(degrees)) < _NEAR:
+            sign = "−" if angle < 0 else ""
+            return f"{sign}{words}", math.copysign(degrees, angle)
+    return None
+
+
+def degrees_in_radians(values: dict[str, Any]) -> Iterator[str]:
+    """A line for each angle in degrees that looks as if it were in rad. values: of a file, as TOML holds them."""
+    told: set[tuple[str, float]] = set()
+    for key, numbers in numbers_in(values):
+        name = key.rpartition(".")[2]
+        for value in numbers.values() if name.endswith(DEGREES) else ():
+            like = like_radians(value)
+            if like is not None and (name, abs(value)) not in told:
+                told.add((name, abs(value)))
+                yield f"{key}: {value:g}° is likely wrong: if {like[0]} rad is meant, that is {like[1]:g}°"
 
 
 def unlikely(config: Config) -> Iterator[str]:
