@@ -12,7 +12,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(INSTALLED)
-	$(BIN)/torchdic demo --out demo
+	$(BIN)/torchdic demo --out demo --restart
 
 # tests run side by side, each on one thread: a test's tensors are too small for more
 test test-all: export OMP_NUM_THREADS := 1

@@ -37,6 +37,7 @@ from data_synthetic.recorder.record import Recording, record
 from data_synthetic.recorder.told import Mistakes, Told, tell
 from data_synthetic.recorder.writing import write_recording
 from recon.cli import main as torchdic
+from recon.config.spelling import canonical
 from recon.report.metrics import volume_error
 from torchdic import Grid
 from torchdic.files.stack import read_volume
@@ -75,8 +76,8 @@ def journey(seed: int, out: Path, *, bead: bool) -> str:
         if bead:
             values["acquisition"]["prisms"] = by_bead(made, out)
         path = saved(values, out / "typed.toml")
-        ran("calibrate", path, "--out", out / "calibration")
-        ran("reconstruct", out / "calibration" / "calibrated.toml", "--out", out / "volume")
+        ran("calibrate", path, "--out", out / "calibration", "--restart")
+        ran("reconstruct", out / "calibration" / "calibrated.toml", "--out", out / "volume", "--restart")
         seconds = time.process_time() - began
         known = saved(typed(written, tell(recording, Mistakes())), out / "known.toml")
         ran("reconstruct", known, "--out", out / "known")
@@ -117,16 +118,20 @@ def by_bead(made: Drawn, out: Path) -> list[dict[str, Any]]:
     seen = record(specimen, field, recording.microscope, recording.acquisition, recording.faults, seed=1)
     values = typed(new(made, seen, out, "bead"), replace(made.told, background=background, lower=False))
     values["calibration"] = {"bead": {"radius": RADIUS, "index": background + CONTRAST}}
-    ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead")
-    found = tomllib.loads((out / "bead" / "calibrated.toml").read_text(encoding="utf-8"))
-    return found["acquisition"]["prisms"]
+    ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead", "--restart")
+    return prisms_and_focus(out / "bead")[0]
+
+
+def prisms_and_focus(calibration: Path) -> tuple[list[dict[str, Any]], list[float]]:
+    """The prisms, by their shear (y, x) and bias in rad, and the planes that a calibration has left."""
+    found = canonical(tomllib.loads((calibration / "calibrated.toml").read_text(encoding="utf-8")))["acquisition"]
+    return found["prisms"], found["focus"]
 
 
 def row(made: Drawn, out: Path, seconds: float) -> str:
     """A recording's line of the table."""
     recording, mistakes = made.recording, made.told.mistakes
-    found = tomllib.loads((out / "calibration" / "calibrated.toml").read_text(encoding="utf-8"))
-    prisms, focus = found["acquisition"]["prisms"], found["acquisition"]["focus"]
+    prisms, focus = prisms_and_focus(out / "calibration")
     right = recording.acquisition
     shears = [complex(p["shear"][1], p["shear"][0]) for p in prisms]
     true = [complex(float(p.shear[1]), float(p.shear[0])) for p in right.prisms if p is not None]

@@ -3,15 +3,21 @@
 import json
 import math
 import tomllib
+from dataclasses import replace
 
 import pytest
 import tomli_w
 import torch
 
 from data_synthetic import Bead
-from recon.calibration.trials.orders import Round
+from recon.calibration.trials.declared import Otherwise
+from recon.calibration.trials.orders import Orders, Round
 from recon.cli import main
 from recon.config import load
+from recon.config.commented import comments_of
+from recon.config.spelling import direction
+from recon.run.calibration.found import FoundQuantity, left
+from recon.run.calibration.provenance import provenance
 from recon.run.calibration.stack import CalibrationStack
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.files.stack import write_stack
@@ -127,6 +133,154 @@ def test_what_cannot_be_a_bead_is_refused_in_one_line(tmp_path, recorded, monkey
     assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert law in said
+
+
+@pytest.mark.parametrize(
+    ("microscope", "section", "law"),
+    [
+        ({}, {"bead": {"radius": 30.0, "index": 1.5}}, "radius: 30 µm is too large for a field of 7.2 µm"),
+        ({"camera": {"pixel_size": 0.1}}, {"bead": {"radius": 3.1, "index": 1.5}}, "3.1 µm is too large for a field"),
+        (
+            {"objective": "none"},
+            {"bead": {"radius": 1.0, "index": 1.5}, "aberrations": [11]},
+            "aberrations: [11] are of an objective, and microscope.objective isn't given",
+        ),
+    ],
+)
+def test_what_no_bead_of_this_field_can_tell_is_refused_before_the_stack_is_read(
+    tmp_path, capsys, microscope, section, law
+):
+    told = {
+        **TOLD,
+        "microscope": TOLD["microscope"] | microscope,
+        "acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)},
+        "calibration": section,
+    }
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert law in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_finished_calibration_is_not_overwritten_unasked(tmp_path, recorded, monkeypatch, capsys):
+    monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None)
+    monkeypatch.setattr("recon.run.calibration.calibrate.by_specimen", lambda stack, _: (stack, []))
+    told = {"acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}}
+    calibrated(tmp_path, recorded, monkeypatch, told)
+    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()}
+    typed = ["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main(typed) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "calibration.json: the folder has results; name another one, or replace them with --restart" in said
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").iterdir()} == before
+    assert main([*typed, "--restart"]) == 0
+
+
+RUN = """# Written by torchdic new.
+
+assumed = ["shear's length", "bias", "condenser's NA", "order of the planes"]
+
+[acquisition]
+prisms = [                               # angle: from right towards down
+    { shear = { length = 0.3, angle_degrees = 300.0 }, bias_degrees = 90.0 }, # SAID
+    { shear = { length = 0.3, angle_degrees = 300.0 }, bias_degrees = -90.0 }, # mine
+]
+focus = { first = -1.2, step = 1.2, count = 3 } # step file; assumed: the first is first; measured: the sharpest is 2
+
+[microscope]
+objective = { na = 0.8 }                 # file
+condenser = { na = 0.5 }                 # assumed: the ring
+wavelength = 0.546                       # file
+
+[volume]
+background = 1.4                         # assumed: water
+shape = [8, 40, 36]                      # slices
+pixel_size = 0.2                         # file
+slice_thickness = 0.5                    # chosen
+
+[data]
+path = "stack.ome.tif"                   # given
+offset = 100.0                           # given
+
+[reconstruction]
+bounds = { lower = 0.0 }                 # assumed: Δn is above 0
+""".replace("SAID", "a: length assumed: usual; told; angle measured: ± 2°; bias assumed: a guess; so")
+
+
+def test_a_calibrated_configuration_is_the_old_one_with_what_was_found(tmp_path, recorded, monkeypatch, capsys):
+    """The same keys and units, the file from its folder, and behind each value where it comes from."""
+
+    def turned(stack, _):
+        """As beside a specimen: 10° further, with another condenser."""
+        config = stack.config
+        prisms = [Prism(direction(0.3, 310.0), bias) for bias in (math.pi / 2, -math.pi / 2)]
+        changed = replace(config, acquisition=replace(config.acquisition, prisms=prisms))
+        microscope = replace(config.microscope, condenser=replace(config.microscope.condenser, na=0.45))
+        angle = FoundQuantity("shear's angle", "rad", [math.radians(-60)], [math.radians(-50)], [0.01], "so")
+        na = FoundQuantity("condenser na", "", 0.5, 0.45, 0.02, "so")
+        return stack.with_config(replace(changed, microscope=microscope)), [angle, na, left("bias", "rad", [1.5], "no")]
+
+    monkeypatch.setattr("recon.run.calibration.calibrate.by_specimen", turned)
+    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(2, 2, 1, 3),))
+    write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 0
+    assert "shear's angle: 310 ± 0.57°, told 300°" in capsys.readouterr().out
+    text = (tmp_path / "out" / "calibrated.toml").read_text(encoding="utf-8")
+    told, values, comments = tomllib.loads(RUN), tomllib.loads(text), comments_of(text)
+    chosen = json.loads((tmp_path / "out" / "calibration.json").read_text())["signs and orders"]["value"]
+    expected = {**told, "assumed": ["shear's length", "bias"]}
+    expected["microscope"]["condenser"]["na"] = 0.45
+    expected["data"]["path"] = "../stack.ome.tif"
+    for prism in expected["acquisition"]["prisms"]:
+        prism["shear"]["angle_degrees"] = 310.0
+    if "focus" in chosen:
+        expected["acquisition"]["focus"] |= {"first": 1.2, "step": -1.2}
+    assert values | {"assumed": sorted(values["assumed"])} == expected | {"assumed": sorted(values["assumed"])}
+    assert set(values["assumed"]) >= {"shear's length", "bias"}
+    angle = "angle calibrated: ± 0.57°, told "
+    assert comments["acquisition.prisms[0]"].startswith(f"a: length assumed: usual; told; {angle}")
+    assert comments["acquisition.prisms[0]"].endswith("; bias assumed: a guess; so")
+    assert comments["acquisition.prisms[1]"].startswith(f"mine; {angle}")
+    assert comments["microscope.condenser"] == "calibrated: ± 0.02, told 0.5"
+    for key in ("microscope.objective", "volume.background", "data.path", "reconstruction.bounds"):
+        assert comments[key] == comments_of(RUN)[key]
+    assert load(tmp_path / "out" / "calibrated.toml").data == load(tmp_path / "run.toml").data
+
+
+def orders(what, acquisition, mistakes):
+    return Orders((), 0.0, Otherwise(what, what, "", acquisition, mistakes), told=True)
+
+
+def test_provenance_says_what_was_calibrated_and_how_well(tmp_path):
+    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
+    config, comments = load(tmp_path / "run.toml"), comments_of(RUN)
+    found = [
+        FoundQuantity("signs and orders", "", "as declared", "focus", None, "so"),
+        FoundQuantity("shear's length", "µm", [0.3], [0.25], [0.011], "so"),
+        FoundQuantity("bias", "rad", [1.5, -1.5], [1.4, -1.4], [0.1, 0.2], "so"),
+        FoundQuantity("condenser na", "", 0.5, 0.49, 0.02, "agrees"),
+        left("shear's angle", "rad", [0.1], "no"),
+    ]
+    reversed_ = replace(config.acquisition, focus=config.acquisition.focus[::-1])
+    made = provenance(config, config, orders("planes reversed", reversed_, 1), found, comments)
+    first, second = made["acquisition.prisms[0]"], made["acquisition.prisms[1]"]
+    assert first == (
+        "a: length calibrated: ± 0.011 µm, told 0.3 µm; angle measured: ± 2°; bias calibrated: ± 5.7°, told 90°"
+    )
+    assert second == "mine; length calibrated: ± 0.011 µm, told 0.3 µm; bias calibrated: ± 11°, told -90°"
+    assert made["microscope.condenser"] == "assumed: the ring; calibrated: 0.49 ± 0.02 agrees with it"
+    assert made["acquisition.prisms"] == "angle: from right towards down; calibrated: planes reversed"
+    assert made["acquisition.focus"] == "step file; calibrated: the planes' order, which was told reversed"
+    as_told = provenance(config, config, orders("all is as declared", config.acquisition, 0), found[:1], comments)
+    assert as_told == {
+        "acquisition.focus": "step file; measured: the sharpest is 2; calibrated: the planes' order, as told"
+    }
+    zero = [FoundQuantity("compensator's zero", "rad", 0.0, 0.1, 0.01, "so")]
+    added = provenance(config, config, None, zero, {})["acquisition.prisms[1]"]
+    assert added == "bias calibrated: the zero, 5.73° ± 0.57°, is added to the told -90°"
+    assert provenance(config, config, None, [left("bias", "rad", None, "no")], comments) == {}
 
 
 def test_levels_of_one_exposure_tell_the_compensators_zero(tmp_path, recorded, monkeypatch):

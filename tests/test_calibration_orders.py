@@ -7,7 +7,7 @@ import torch
 
 from recon.calibration.part import part_of
 from recon.calibration.trials.declared import all_mistakes, images_of, one_mistake
-from recon.calibration.trials.orders import LIKELY, Round, find_orders
+from recon.calibration.trials.orders import LIKELY, Orders, Round, Tried, find_orders
 from recon.fit.problem import Problem, Recipe
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -42,7 +42,22 @@ def test_axes_signs_and_orders_make_so_many_descriptions(acquisition, number):
 
 def test_exchanging_a_pair_of_opposite_bias_is_reversing_its_sign():
     assert "sign" in names(PAIR)
-    assert "prisms" not in names(PAIR)
+    assert not any("prisms" in name for name in names(PAIR))
+
+
+def test_every_description_has_a_name_of_its_own_that_says_its_order():
+    shears = ((0.0, 0.24), (0.24, 0.0))
+    declared = Acquisition([Prism(shear, bias) for shear in shears for bias in (BIAS, 0.5 * BIAS)], FOCUS)
+    found = {other.name: other for other in all_mistakes(declared)}
+    assert len(found) == len(all_mistakes(declared))
+    a, b, c, d = declared.prisms
+    assert found["prisms 1↔3"].acquisition.prisms == (c, b, a, d)
+    assert found["prisms in order 2, 3, 1, 4"].acquisition.prisms == (b, c, a, d)
+    assert found["prisms in order 2, 3, 1, 4"].advice == "put acquisition.prisms in the order 2, 3, 1, 4"
+    tried = tuple(Tried(other, 1.0, 1.0, 1) for other in found.values())
+    table = Orders(tried, 0.0, tried[0].otherwise, told=True).table(30)
+    assert "prisms 1↔3 " in table
+    assert "prisms: of acquisition.prisms, from 1" in table
 
 
 def test_two_mistakes_at_once_are_among_them():

@@ -331,6 +331,16 @@ def test_demo_checks_its_folder_before_it_begins(refused, tmp_path):
     assert "can't be written to" in refused("demo", out=tmp_path / "file")
 
 
+@pytest.mark.parametrize("command", ["calibrate", "reconstruct", "simulate", "plan", "work-precision"])
+@pytest.mark.parametrize("name", ["stack.ome.tif", "planes"])
+def test_images_in_a_configurations_place_point_to_new(refused, tmp_path, command, name):
+    write_stack(tmp_path / "stack.ome.tif", stack())
+    (tmp_path / "planes").mkdir()
+    line = refused(command, tmp_path / name)
+    kind = "a folder" if name == "planes" else "an image"
+    assert f"{name}: is {kind}, not a configuration; torchdic new {tmp_path / name} --out run.toml writes" in line
+
+
 # what works
 
 

@@ -438,7 +438,9 @@ def test_a_file_that_is_not_utf_8_is_told(tmp_path):
 
 def test_a_missing_file_and_a_folder_are_told(tmp_path):
     assert the_error(tmp_path / "none.toml") == "No such file or directory"
-    assert the_error(tmp_path) == "Is a directory"
+    assert the_error(tmp_path) == (
+        f"is a folder, not a configuration; torchdic new {tmp_path} --out run.toml writes one for a stack"
+    )
 
 
 def test_an_empty_file_misses_its_first_section(write):

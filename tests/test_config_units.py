@@ -7,7 +7,7 @@ import tomli_w
 from refusal import the_error
 
 from recon.config import load
-from recon.config.units import wrong_unit
+from recon.config.plausible.impossible import impossible
 
 TEXT = """
 [volume]                       # µm
@@ -78,6 +78,22 @@ def test_half_a_character_of_utf_16_is_told(put):
     message = the_error(put(TEXT.encode("utf-16")[:-1]))
     assert "its byte-order mark says UTF-16" in message
     assert "save the file as UTF-8" in message
+
+
+@pytest.mark.parametrize(
+    ("point", "comma"), [("wavelength = 0.546", "wavelength = 0,546"), ("{ na = 0.9 }", "{ na = 0,9 }")]
+)
+def test_a_decimal_comma_is_told_with_its_line(put, point, comma):
+    assert point in TEXT
+    message = the_error(put(TEXT.replace(point, comma).encode()))
+    wrong = comma.strip("{ }").rpartition(" ")[2]
+    line = TEXT[: TEXT.index(point)].count("\n") + 1
+    assert message == f"is not TOML: {wrong} in line {line} has a decimal comma: write {wrong.replace(',', '.')}"
+
+
+def test_another_fault_is_not_put_down_to_a_comma(put):
+    text = TEXT.replace("[volume]", "[volume")
+    assert "decimal comma" not in the_error(put(text.encode()))
 
 
 # --- units ------------------------------------------------------------------------------------------------------------
@@ -162,19 +178,19 @@ def test_a_value_in_another_unit_is_named_with_its_key_and_with_the_value_in_the
     ],
 )
 def test_what_may_be_right_is_allowed(key, value):
-    assert wrong_unit(changed(key, value)) is None
+    assert impossible(changed(key, value)) is None
 
 
 def test_a_low_aperture_is_focused_far_away():
     values = changed("acquisition/focus", [-500, 500])
-    assert wrong_unit(values) is not None
+    assert impossible(values) is not None
     values["microscope"]["objective"]["na"] = 0.1
-    assert wrong_unit(values) is None
+    assert impossible(values) is None
     del values["microscope"]["objective"]  # nothing tells how deep the field is
-    assert wrong_unit(values) is None
+    assert impossible(values) is None
 
 
 @pytest.mark.parametrize("value", [0, -0.546, float("nan"), float("inf"), "546", True, None, [], {}])
 def test_what_breaks_another_law_is_left_to_it(value):
-    assert wrong_unit(changed("microscope/wavelength", value)) is None
-    assert wrong_unit(changed("volume", value)) is None
+    assert impossible(changed("microscope/wavelength", value)) is None
+    assert impossible(changed("volume", value)) is None

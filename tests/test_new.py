@@ -1,8 +1,10 @@
 """torchdic new: recorded stacks of several kinds give back what was put in, and the file that is written runs."""
 
+import argparse
 import math
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +16,15 @@ from data_synthetic.recorder.record import Finer, record
 from data_synthetic.recorder.writing import KINDS, write_recording
 from data_synthetic.scenes.any_specimen import solid
 from recon.cli import main
+from recon.cli.arguments import repeated
+from recon.cli.own_stack.new import arguments
+from recon.cli.own_stack.options import OPTIONS, SEVERAL
 from recon.cli.own_stack.settled import settle, slices_of
+from recon.cli.own_stack.table import warnings_of
 from recon.config.commented import Line, commented, inline
+from recon.config.plausible.unlikely import like_radians
 from recon.config.reading import load
+from recon.config.schema import UnlikelyWarning
 from recon.recording.survey.direction import ShearDirection
 from recon.recording.survey.survey import SettingSurvey, Survey
 from torchdic import Acquisition, Camera, Condenser, Grid, Microscope, Objective, Prism
@@ -112,6 +120,7 @@ def test_options_fill_in_what_the_file_lacks(tmp_path, recording):
         "background": 1.34,
         "shear": 0.25,
         "bias": 80,
+        "offset": 60,
     }
     words = [word for name, value in options.items() for word in (f"--{name}", value)]
     assert new(written(recording, tmp_path, "tiff"), "--out", tmp_path / "run.toml", *words) == 0
@@ -120,10 +129,40 @@ def test_options_fill_in_what_the_file_lacks(tmp_path, recording):
     assert config.microscope.condenser is not None
     assert (config.microscope.wavelength, config.microscope.condenser.na) == (0.546, 0.6)
     assert config.volume.background == 1.34
+    assert config.data is not None
+    assert config.data.offset == 60
     (first, _), shear = config.acquisition.prisms, 0.25
     assert first is not None
     assert math.hypot(*map(float, first.shear)) == pytest.approx(shear)
     assert float(first.bias) == pytest.approx(math.radians(80))
+
+
+def test_every_value_that_is_assumed_is_named_as_assumed(tmp_path, recording):
+    """In run.toml's comments, by the quantity that they are of."""
+    assert new(written(recording, tmp_path, "tiff"), "--out", tmp_path / "run.toml") == 0
+    text, config = (tmp_path / "run.toml").read_text(), load(tmp_path / "run.toml")
+    names = {
+        "length assumed": "shear's length",
+        "bias assumed": "bias",
+        "step assumed": "focus step",
+        "assumed: the first plane": "order of the planes",
+        "objective =": "objective's NA",
+        "condenser =": "condenser's NA",
+        "wavelength =": "wavelength",
+        "background =": "medium's index",
+        "pixel_size =": "pixel size",
+        "offset =": "camera's offset",
+        "bounds =": "sign of Δn",
+    }
+    found = {name for line in values(text) if "assumed" in line for words, name in names.items() if words in line}
+    assert set(config.assumed) == found
+    assert "camera's offset" in found
+
+
+def test_floats_have_no_dark_counts_to_be_assumed(tmp_path, recording):
+    write_stack(tmp_path / "f.tif", recording.data.astype(np.float32) / 900, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "f.tif", "--out", tmp_path / "run.toml") == 0
+    assert "camera's offset" not in load(tmp_path / "run.toml").assumed
 
 
 def test_a_lower_index_turns_the_shear_and_the_bounds(tmp_path, recording):
@@ -174,13 +213,45 @@ def test_nothing_is_overwritten(tmp_path, recording, capsys):
     assert (tmp_path / "run.toml").read_text() == "mine"
 
 
+@pytest.mark.parametrize("named", ["folder", "files"])
+def test_all_that_would_be_overwritten_is_said_at_once(tmp_path, recording, capsys, named):
+    folder, out = written(recording, tmp_path, "folder"), tmp_path / "run.toml"
+    stacks = [folder] if named == "folder" else sorted(folder.glob("*.tif"))
+    joined = tmp_path / "run.stack.ome.tif"
+    joined.write_text("mine")
+    assert new(*stacks, "--out", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{joined}: is there already, and isn't overwritten; choose another name or remove it" in line
+    out.write_text("mine")
+    assert new(*stacks, "--out", out) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{out} and {joined}: are there already, and aren't overwritten" in line
+    # of one file no stack is joined
+    assert new(written(recording, tmp_path), "--out", out) == 2
+    assert f"error: {out}: is there already" in capsys.readouterr().err
+    assert out.read_text() == joined.read_text() == "mine"
+
+
+def test_a_configuration_below_a_file_is_refused_before_the_stack_is_read(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert new(tmp_path / "missing.tif", "--out", tmp_path / "file" / "run.toml") == 2
+    assert "file is a file, not a folder" in capsys.readouterr().err
+
+
 REFUSALS = {
+    (
+        "--z-step",
+        "640",
+    ): "--z-step: 640 µm is no distance between focus planes (0.001 to 100 µm); lengths are in",
+    ("--shear-angle", "10", "20", "30"): "--shear-angle 10 20 30: 3 angles, and the images show one axis of shear in 2",
     ("--wavelength", "546"): "546 µm is no wavelength of light (0.01 to 20 µm); lengths are in µm: 546 nm are 0.546 µm",
     ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",
     ("--shear", "180"): "--shear: 180 µm is no shear",
     ("--na", "0"): "--na 0 must be above 0",
     ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
     ("--background", "0.9"): "--background 0.9 must be at least 1",
+    ("--background", "13.6"): "--background: 13.6 is no refractive index of a transparent medium (at most 6); is the",
+    ("--offset", "-1"): "--offset -1 must be at least 0, and finite",
     ("--bias", "nan"): "--bias nan must be",
     ("--out", "run.txt"): "must end in .toml",
 }
@@ -193,6 +264,75 @@ def test_what_cannot_be_is_one_line_and_leaves_no_file(tmp_path, recording, word
     (line,) = capsys.readouterr().err.splitlines()
     assert REFUSALS[words] in line
     assert not (tmp_path / "run.toml").exists()
+
+
+def test_what_is_unusual_is_remarked_and_written(tmp_path, recording, capsys):
+    words = ("--na", 0.5, "--condenser-na", 1.3, "--background", 2.4)
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", *words) == 0
+    printed = capsys.readouterr().out
+    assert "warning: microscope.condenser.na: 1.3 is above the objective's NA 0.5, which is unusual: DIC" in printed
+    assert "warning: volume.background: 2.4 is likely wrong" in printed
+    with pytest.warns(UnlikelyWarning, match=r"condenser\.na: 1\.3|background: 2\.4"):
+        assert load(tmp_path / "run.toml").volume.background == 2.4
+
+
+@pytest.mark.parametrize("option", [f"--{name}" for name in OPTIONS])
+def test_a_decimal_comma_is_refused_with_the_number_in_its_place(tmp_path, capsys, option):
+    with pytest.raises(SystemExit) as exit_:
+        new(tmp_path / "s.tif", "--out", tmp_path / "run.toml", option, "0,16")
+    assert exit_.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"torchdic new: error: argument {option}: 0,16 has a decimal comma: write 0.16"
+    with pytest.raises(SystemExit):
+        new(tmp_path / "s.tif", "--out", tmp_path / "run.toml", option, "much")
+    assert f"argument {option}: 'much' is no number" in capsys.readouterr().err
+
+
+def test_options_are_checked_before_the_stack_is_read(tmp_path, capsys):
+    assert new(tmp_path / "missing.tif", "--out", tmp_path / "run.toml", "--na", -1) == 2
+    assert "--na -1 must be above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--shear-angle", "40", "130", "s.tif"], [40.0, 130.0]),
+        (["--shear-angle", "-40", "--shear-angle=130", "1e2", "--lower", "s.tif"], [-40.0, 130.0, 100.0]),
+        (["s.tif", "--shear-angle", "40"], [40.0]),
+    ],
+)
+def test_an_option_of_several_numbers_takes_no_stack_for_one(words, told):
+    parser = argparse.ArgumentParser()
+    arguments(parser)
+    options = parser.parse_args(repeated(["--out", "run.toml", *words], SEVERAL))
+    assert options.shear_angle == told
+    assert options.stack == [Path("s.tif")]
+
+
+def test_a_stack_that_is_named_like_a_number_stays_a_stack(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "130").mkdir()
+    assert repeated(["--shear-angle", "40", "130"], SEVERAL) == ["--shear-angle", "40", "130"]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--bias", 1.57), "warning: --bias 1.57 is taken as 1.57°; if π/2 rad is meant, give 90"),
+        (("--bias", -0.785), "warning: --bias -0.785 is taken as -0.785°; if −π/4 rad is meant, give -45"),
+        (("--shear-angle", 0.524), "warning: --shear-angle 0.524 is taken as 0.524°; if π/6 rad is meant, give 30"),
+    ],
+)
+def test_an_angle_that_looks_like_radians_is_warned_of_once(tmp_path, recording, capsys, words, line):
+    assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", *words) == 0
+    assert capsys.readouterr().out.count(line) == 1
+    with pytest.warns(UnlikelyWarning, match="rad is meant") as caught:
+        load(tmp_path / "run.toml")
+    assert len(caught) == 1
+
+
+def test_angles_that_are_degrees_are_not_warned_of():
+    assert all(like_radians(angle) is None for angle in (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 30.2, 45.0, 85.0, 90.0, 1.6))
 
 
 def test_a_folder_of_nothing_is_one_line(tmp_path, capsys):
@@ -292,6 +432,41 @@ def test_settings_along_one_axis_share_its_angle_and_differ_in_bias(name):
     settled = settle(Gathered(stack, (), StatedSetup()), Survey(tuple(alike), 1, None, nothing, nothing, 0), {})
     found = [(angle.value, bias.value) for _, angle, bias in settled.prisms]
     assert found == [(pytest.approx(angle, abs=0.1), bias) for angle, bias in expected]
+
+
+def settled_of(settings, **given):
+    nothing = np.zeros((4, 4), bool)
+    alike = [replace(each, likeness=each.likeness or (0.0,) * number) for number, each in enumerate(settings)]
+    found = Survey(tuple(alike), 1, None, nothing, nothing, 0)
+    gathered = Gathered(Stack(np.ones((len(settings), 3, 4, 4), np.uint16)), (), StatedSetup())
+    return gathered, found, settle(gathered, found, given)
+
+
+TWO_AXES = [setting(41), setting(219), setting(131), setting(309)]
+GIVEN_ANGLES = {
+    (30.0,): [(30, 90, "given"), (30, -90, "given"), (130, 90, "measured"), (130, -90, "measured")],
+    (30.0, 120.0): [(30, 90, "given"), (30, -90, "given"), (120, 90, "given"), (120, -90, "given")],
+    # one for each setting: where a pair's second is given reversed, its bias has the first one's sign
+    (30.0, 30.0, 120.0, 300.0): [(30, 90, "given"), (30, -90, "given"), (120, 90, "given"), (300, 90, "given")],
+}
+
+
+@pytest.mark.parametrize("angles", GIVEN_ANGLES)
+def test_angles_are_given_for_the_first_axis_for_each_or_for_each_setting(angles):
+    *_, settled = settled_of(TWO_AXES, shear_angle=angles)
+    found = [(angle.value, bias.value, angle.origin) for _, angle, bias in settled.prisms]
+    assert found == [(pytest.approx(angle, abs=1.5), bias, origin) for angle, bias, origin in GIVEN_ANGLES[angles]]
+
+
+def test_an_axis_whose_angle_is_not_given_is_remarked():
+    gathered, found, settled = settled_of(TWO_AXES, shear_angle=(45.0,))
+    lines = warnings_of(gathered, found, settled)
+    assert any("--shear-angle 45 is of the first axis alone; settings 3 and 4 have another" in line for line in lines)
+    gathered, found, settled = settled_of(TWO_AXES, shear_angle=(45.0, 310.0))
+    said = "\n".join(warnings_of(gathered, found, settled))
+    assert "first axis alone" not in said
+    assert said.count("310° is given: reversed") == 1
+    assert "45° is given" not in said
 
 
 def test_the_angle_is_as_uncertain_as_its_settings_are_apart():

@@ -143,7 +143,7 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys):
     for words, message in (
         ((tmp_path / "none.tif", "--out", tmp_path / "out"), "no such file"),
         ((tmp_path / "noise.tif", "--out", tmp_path / "out"), "shows no direction of shear"),
-        ((tmp_path / "noise.tif", "--out", tmp_path / "done"), "the folder has a phase; name another one"),
+        ((tmp_path / "noise.tif", "--out", tmp_path / "done"), "the folder has results; name another one, or replace"),
         ((tmp_path / "noise.tif", "--out", tmp_path / "out", "--plane", 3), "--plane 3 must be from 1 to 2"),
         ((tmp_path / "noise.tif", "--out", tmp_path / "out", "--setting", 2), "--setting 2 must be from 1 to 1"),
         ((tmp_path / "noise.tif", "--out", tmp_path / "out", "--shear-angle", "inf"), "must be a finite angle"),

@@ -8,6 +8,7 @@ from torch import Tensor
 from data_synthetic import Bead
 from recon.calibration.known_specimen import ModelledSpecimen
 from recon.config.reading import load
+from recon.config.rewritten import Source
 from recon.config.schema import BeadSection, ConfigError
 from recon.run.calibration.calibrate import calibrate
 from torchdic import Grid
@@ -20,7 +21,8 @@ def run(options: argparse.Namespace) -> None:
         raise ConfigError(f"{options.config}: missing key data.path: a calibration needs a stack")
     section = config.calibration.bead
     bead = None if section is None else known_bead(section, config.volume.background)
-    calibrate(config, options.out, options.device, bead)
+    source = Source.of(options.config)
+    calibrate(config, options.out, options.device, bead, source=source, restart=options.restart)
 
 
 def known_bead(section: BeadSection, background: float) -> ModelledSpecimen:

@@ -11,9 +11,11 @@ from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
 from recon.cli.own_stack import new, phase
-from recon.config.schema import AssumedWarning, ConfigError
+from recon.cli.own_stack.options import SEVERAL
+from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
+from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
 from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
@@ -25,35 +27,40 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names."""
+    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names.
+
+    several: its options that take several numbers.
+    """
 
     help: str
     run: Callable[[argparse.Namespace], None]
     arguments: tuple[Callable[[argparse.ArgumentParser], None], ...]
     aliases: tuple[str, ...] = ()
+    several: tuple[str, ...] = ()
 
 
 COMMANDS = {
     "demo": Command(
         "simulate a small bead, reconstruct it in three ways and compare each with the truth",
         demo.run,
-        (arguments.out,),
+        (arguments.out, arguments.restart),
     ),
     "simulate": Command(
         "simulate the DIC images of a known specimen",
         simulate.run,
-        (arguments.config, arguments.out, arguments.device),
+        (arguments.config, arguments.out, arguments.device, arguments.restart),
     ),
     "new": Command(
         "write a configuration for a recorded stack, from its file and its images",
         new.run,
         (new.arguments,),
         ("init",),
+        several=SEVERAL,
     ),
     "phase": Command(
         "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
         phase.run,
-        (phase.arguments,),
+        (phase.arguments, arguments.out, arguments.restart),
     ),
     "plan": Command(
         "find the fastest way to compute images within a tolerance, and which effects matter",
@@ -63,7 +70,7 @@ COMMANDS = {
     "calibrate": Command(
         "find signs, orders and values of the optics, as far as the images of a stack tell them",
         calibrate.run,
-        (arguments.config, arguments.out, arguments.device),
+        (arguments.config, arguments.out, arguments.device, arguments.restart),
     ),
     "reconstruct": Command(
         "find the refractive-index volume behind a stack of DIC images",
@@ -85,11 +92,14 @@ def main(typed: Sequence[str] | None = None) -> int:
     Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
     """
     write_plainly()
-    options = _parser().parse_args(typed)
+    words = list(sys.argv[1:] if typed is None else typed)
+    rows = [row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)]
+    several = rows[0].several if rows else ()
+    options = _parser().parse_args(arguments.repeated(words, several))
     _show_each_warning_once()
     try:
         options.run(options)
-    except (ConfigError, StackError, CheckpointError, ResultsError, WriteError) as error:
+    except (ConfigError, StackError, CheckpointError, FinishedError, ResultsError, WriteError) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
@@ -141,7 +151,7 @@ def _show_each_warning_once() -> None:
             tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
 
     warnings.showwarning = show
-    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning):
+    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning, UnlikelyWarning):
         warnings.simplefilter("always", kind)
 
 

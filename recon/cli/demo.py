@@ -10,7 +10,9 @@ from recon.fit.problem import Recipe
 from recon.report import figures
 from recon.report.comparison import Truth, compare, table
 from recon.run.exact_images import exact_images
-from recon.run.reconstruct import RECOMMENDED, prepare_folder
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
+from recon.run.reconstruct import RECOMMENDED
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 from torchdic.files.stack import write_stack
 
@@ -21,6 +23,9 @@ ACQUISITION = Acquisition(
     [Prism(shear, bias) for shear in ((0.0, 0.24), (0.24, 0.0)) for bias in (math.pi / 2, -math.pi / 2)],
     [float(z) for z in range(-4, 5)],
 )
+# The last files that it leaves.
+RESULTS = ("comparison.png", "comparison.json")
+
 # On straight and bent rays Newton's steps err more than Adam's: they take Adam's, as many as gain them something.
 CONTENDERS = (
     (Fidelity("projection"), Recipe(method="adam", steps=60)),
@@ -31,6 +36,7 @@ CONTENDERS = (
 
 def run(options: argparse.Namespace) -> None:
     """Simulate the bead's stack from its exact field, reconstruct it by each contender, and print their scores."""
+    check_no_results(options.out, RESULTS, restart=options.restart)
     prepare_folder(options.out)
     print("A 5 µm bead of index 1.59 in cement of 1.56: DIC stack from its exact field …", flush=True)
     data = exact_images(BEAD, GRID, MICROSCOPE, ACQUISITION, Fidelity(sources=150)).float()

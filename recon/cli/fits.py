@@ -21,8 +21,8 @@ from recon.run.fits.finer import FinerModel
 from recon.run.fits.kept import KeptTrials
 from recon.run.fits.ladder import fits_of
 from recon.run.fits.trials import Recorded, fit_trials
+from recon.run.folder.prepared import prepare_folder
 from recon.run.interruption import InterruptedRunError, signals_kept
-from recon.run.reconstruct import prepare_folder
 from torchdic.files.format import Stack
 
 

@@ -12,7 +12,7 @@ from recon.config.schema import Config, ConfigError
 from recon.earlier.tikhonov import tikhonov
 from recon.fit.setup import Setup, empty_medium
 from recon.run.data import load_data
-from recon.run.reconstruct import prepare_folder
+from recon.run.folder.prepared import prepare_folder
 from torchdic import Volume
 from torchdic.files.whole import write_json
 

@@ -15,15 +15,19 @@ from recon.config.schema import Config, ConfigError
 from recon.fit.planned import announce
 from recon.report import figures
 from recon.run.exact_images import exact_images
-from recon.run.reconstruct import prepare_folder
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 from torchdic import STANDARD, Fidelity, Volume, image, plan
 from torchdic.files.stack import equal_step, write_stack
 from torchdic.files.whole import write_json
 from torchdic.forward.foresee import check_fits
 
+STACK = "stack.ome.tif"
+
 
 def run(options: argparse.Namespace) -> None:
     """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder."""
+    check_no_results(options.out, (STACK,), restart=options.restart)
     config = load(options.config)
     specimen = specimen_of(config, str(options.config))
     if config.simulation.exact and config.tolerance is not None:
@@ -78,9 +82,9 @@ def _write(config: Config, images: Tensor, out: Path) -> None:
     focus = [float(f) for f in acquisition.focus]
     # a camera's counts stay integers, which is how a reader of the file recognises them
     data = images.float() if images.is_floating_point() else images
-    write_stack(out / "stack.ome.tif", data, pixel, equal_step(focus))
+    write_stack(out / STACK, data, pixel, equal_step(focus))
     figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), out / "stack.png")
     if config.tolerance is None:  # otherwise the plan has left it
         leave_resolved(config, out)
     prisms, planes, ny, nx = images.shape
-    print(f"{out / 'stack.ome.tif'}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")
+    print(f"{out / STACK}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")

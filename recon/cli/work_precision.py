@@ -15,13 +15,17 @@ from recon.config.schema import Config, ConfigError
 from recon.report import figures
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
 from recon.run.exact_images import exact_images
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 from recon.run.interruption import InterruptedRunError
-from recon.run.reconstruct import prepare_folder
 from torchdic import Candidate, Fidelity, Trial
 from torchdic.files.whole import write_json
 from torchdic.planning.comparisons import TRUTH
 from torchdic.planning.ladders import reaches_a_side
 from torchdic.planning.work_precision import converged_fidelities, ladder, trials
+
+# The file of a finished run.
+RESULTS = "work_precision.json"
 
 
 def run(options: argparse.Namespace) -> None:
@@ -29,9 +33,9 @@ def run(options: argparse.Namespace) -> None:
     if options.fit:
         fits.run(options)
         return
-    for name in ("resume", "restart"):
-        if getattr(options, name):
-            raise ConfigError(f"--{name} goes with --fit: images are measured anew each time")
+    if options.resume:
+        raise ConfigError("--resume goes with --fit: images are measured anew each time")
+    check_no_results(options.out, (RESULTS,), restart=options.restart)
     config = load(options.config)
     specimen = specimen_of(config, str(options.config))
     check_exact_field(config, specimen, str(options.config))
@@ -77,7 +81,7 @@ def _references(config: Config, candidates: Sequence[Candidate]) -> dict[str, Fi
 def _write(found: Sequence[Trial], reference: Mapping[str, Fidelity], scene: str, out: Path) -> None:
     """Write the measurements as CSV, JSON and a figure, and print them as a table."""
     write_csv(out / "work_precision.csv", found)
-    write_json(out / "work_precision.json", as_dict(found, reference))
+    write_json(out / RESULTS, as_dict(found, reference))
     figures.save(draw_fronts({scene: found}), out / "work_precision.png")
     print(as_table(found))
     print(f"\n{out / 'work_precision.csv'}, .json and .png: {len(found)} candidates")

@@ -6,6 +6,6 @@ key, the value and the law.
 
 from recon.config.conversion import dump, flat
 from recon.config.reading import load, structure
-from recon.config.schema import Config, ConfigError, UnitsWarning
+from recon.config.schema import Config, ConfigError, UnitsWarning, UnlikelyWarning
 
-__all__ = ["Config", "ConfigError", "UnitsWarning", "dump", "flat", "load", "structure"]
+__all__ = ["Config", "ConfigError", "UnitsWarning", "UnlikelyWarning", "dump", "flat", "load", "structure"]

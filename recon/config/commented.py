@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -50,6 +51,46 @@ def commented(head: Sequence[str], top: Sequence[Line], tables: Mapping[str, Seq
     return "\n".join(lines) + "\n"
 
 
+def comments_of(text: str) -> dict[str, str]:
+    """The comments behind the values of a TOML text, by their keys, such as volume.shape.
+
+    Of an array whose elements stand in lines of their own, an element's comment has its number: acquisition.prisms[0].
+    Comments in lines of their own belong to no key, nor do those of tables in an array.
+    """
+    found: dict[str, str] = {}
+    table, array, number = "", "", 0
+    for line in text.splitlines():
+        code, comment = _split(line)
+        key = ""
+        if array:
+            if code.startswith("]"):
+                array = ""
+            elif code:
+                key, number = f"{array}[{number}]", number + 1
+        elif code.startswith("["):
+            table = code.strip("[] ") + "."
+        elif named := re.match(r"([\w.-]+)\s*=\s*(.*)", code):
+            key = f"{table}{named[1]}"
+            array, number = (key, 0) if named[2] == "[" else ("", 0)
+        if key and comment:
+            found[key] = comment
+    return found
+
+
+def _split(line: str) -> tuple[str, str]:
+    """The code and the comment of a line; a # within quotes begins none."""
+    quote, escaped = "", False
+    for place, sign in enumerate(line):
+        if quote:
+            quote = "" if sign == quote and not escaped else quote
+            escaped = sign == "\\" and quote == '"' and not escaped
+        elif sign in "'\"":
+            quote = sign
+        elif sign == "#":
+            return line[:place].strip(), line[place + 1 :].strip()
+    return line.strip(), ""
+
+
 def inline(value: Any) -> str:
     """A value of TOML in one line. Raises TypeError for what TOML can't hold."""
     match value:
@@ -59,9 +100,8 @@ def inline(value: Any) -> str:
             return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
         case int():
             return str(value)
-        case float() if math.isfinite(value):
-            text = f"{value:.6g}"
-            return text if any(sign in text for sign in ".e") else f"{text}.0"
+        case float() if not math.isnan(value):
+            return repr(value)
         case list() | tuple():
             return f"[{', '.join(map(inline, value))}]"
         case dict():

@@ -42,17 +42,7 @@ converter = cattrs.Converter(forbid_extra_keys=True)
 
 def dump(config: Config) -> str:
     """The whole configuration as TOML, with every default; what is absent by default is left out."""
-    return tomli_w.dumps(_plain(config))
-
-
-def dump_microscope(config: Config) -> str:
-    """The microscope and the prisms as TOML, to be included by the configurations of other stacks."""
-    return tomli_w.dumps(
-        {
-            "microscope": _plain(config.microscope),
-            "acquisition": {"prisms": _plain(tuple(config.acquisition.prisms))},
-        }
-    )
+    return tomli_w.dumps(plain(config))
 
 
 def flat(config: Config) -> list[str]:
@@ -68,21 +58,21 @@ def flat(config: Config) -> list[str]:
         else:
             yield f"{key} = {value!r}"
 
-    return list(lines("", _plain(config)))
+    return list(lines("", plain(config)))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """A value as TOML can hold it: tensors as arrays, bright field by its name, None by its word or left out.
 
     None is left out where it is the default.
     """
     if dataclasses.is_dataclass(value):
         values = {f.name: (getattr(value, f.name), f.default) for f in dataclasses.fields(value)}
-        return {k: NONE if v is None else _plain(v) for k, (v, usual) in values.items() if not (v is usual is None)}
+        return {k: NONE if v is None else plain(v) for k, (v, usual) in values.items() if not (v is usual is None)}
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items() if v is not None}
+        return {str(k): plain(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
-        return [BRIGHT_FIELD if v is None else _plain(v) for v in value]
+        return [BRIGHT_FIELD if v is None else plain(v) for v in value]
     return value.tolist() if isinstance(value, Tensor) else value
 
 

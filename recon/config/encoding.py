@@ -1,6 +1,9 @@
 """The text of a configuration file, in whatever encoding its editor saved it."""
 
 import codecs
+import re
+import tomllib
+from typing import Any
 
 # Byte-order marks, longest first: UTF-32's begins with UTF-16's.
 _MARKS = (
@@ -10,6 +13,9 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+
+# A number with a decimal comma, in no array.
+_COMMA = re.compile(r"^[^#\[\n]*=\s*([+-]?\d+,\d+)\s*[#}\n]", re.MULTILINE)
 
 
 def decoded(content: bytes) -> str:
@@ -25,6 +31,21 @@ def decoded(content: bytes) -> str:
     if encoding is None and "\0" in text:
         raise ValueError("it seems to be UTF-16 or UTF-32 without a byte-order mark; save the file as UTF-8")
     return text
+
+
+def values_in(content: bytes) -> dict[str, Any]:
+    """The values of a TOML file. Raises ValueError where it is none; a decimal comma is said to be one."""
+    text = ""
+    try:
+        text = decoded(content)
+        return tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError is one
+        comma = _COMMA.search(text)
+        if comma is None:
+            raise ValueError(f"is not TOML: {error}") from error
+        line, number = text.count("\n", 0, comma.start(1)) + 1, comma[1]
+        point = number.replace(",", ".")
+        raise ValueError(f"is not TOML: {number} in line {line} has a decimal comma: write {point}") from error
 
 
 def _undecodable(error: UnicodeDecodeError, content: bytes, encoding: str | None) -> str:

@@ -3,12 +3,12 @@
 A microscope is described once and used for many specimens: `include = "microscope.toml"`.
 """
 
-import tomllib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from recon.config.encoding import decoded
+from recon.config.encoding import values_in
 from recon.config.spelling import ALTERNATIVES
 
 INCLUDE = "include"
@@ -42,11 +42,9 @@ def values_of(path: Path) -> tuple[Table, list[Path]]:
 def _values(path: Path, above: tuple[Path, ...], found: list[Path]) -> Table:
     """above: the files by which this one is included, outermost first. found: grows by those that it includes."""
     try:
-        values = tomllib.loads(decoded(path.read_bytes()))
+        values = values_in(path.read_bytes())
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
-    except ValueError as error:  # TOMLDecodeError is one
-        raise ValueError(f"is not TOML: {error}") from error
     values = _from_folder(values, path.parent)
     chain, beneath = (*above, path.resolve()), {}
     for name in _names(values.pop(INCLUDE, [])):
@@ -92,19 +90,37 @@ def _over(upper: Table, lower: Table, key: str = "") -> Table:
     return merged
 
 
+def seen_from(folder: Path, file: Path) -> str:
+    """A file's name as a configuration in a folder says it: from there, unless it is on another drive."""
+    try:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:
+        return str(file.resolve())
+
+
+def relative_to(values: Table, folder: Path) -> Table:
+    """The values with names of files as `seen_from` a folder; the inverse of what `values_of` does with them."""
+    return _with_files(values, lambda name: seen_from(folder, Path(name)))
+
+
 def _from_folder(values: Table, folder: Path) -> Table:
     """The values with relative names of files starting from a folder."""
+    return _with_files(values, lambda name: str((folder / name).resolve()))
 
-    def absolute(name: Any) -> Any:
+
+def _with_files(values: Table, change: Callable[[str], str]) -> Table:
+    """The values with all names of files changed."""
+
+    def changed(name: Any) -> Any:
         if isinstance(name, list):
-            return [absolute(one) for one in name]
-        return str((folder / name).resolve()) if isinstance(name, str) and name not in _WORDS else name
+            return [changed(one) for one in name]
+        return change(name) if isinstance(name, str) and name not in _WORDS else name
 
     for section, key in _FILES:
-        values = _changed(values, section, lambda table, key=key: _changed(table, key, absolute))
+        values = _changed(values, section, lambda table, key=key: _changed(table, key, changed))
 
     def prisms(found: Any) -> Any:
-        return [_changed(prism, "file", absolute) for prism in found] if isinstance(found, list) else found
+        return [_changed(prism, "file", changed) for prism in found] if isinstance(found, list) else found
 
     return _changed(values, "acquisition", lambda table: _changed(table, "prisms", prisms))
 

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import os
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,11 +11,13 @@ from cattrs import transform_error
 from cattrs.errors import ForbiddenExtraKeysError
 
 from recon.config.conversion import converter
-from recon.config.encoding import decoded
+from recon.config.encoding import values_in
 from recon.config.including import INCLUDE, values_of
-from recon.config.schema import Config, ConfigError, UnitsWarning
+from recon.config.plausible.impossible import impossible
+from recon.config.plausible.unlikely import degrees_in_radians, unlikely
+from recon.config.schema import Config, ConfigError, UnitsWarning, UnlikelyWarning
 from recon.config.spelling import FURTHER, canonical, unknown_key
-from recon.config.units import wrong_unit
+from torchdic.files.stack import FORMATS
 
 T = TypeVar("T")
 
@@ -24,10 +25,12 @@ T = TypeVar("T")
 def load(path: str | os.PathLike[str]) -> Config:
     """Read a configuration file, with those that it includes. A relative path in a file starts from its folder.
 
-    Raises ConfigError where the file can't be used, or where a value can't be in its unit, such as a wavelength of 546
-    µm. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit.
+    Raises ConfigError where the file can't be used, or where a value can't be, such as a wavelength of 546 µm or an
+    index of 13.6. Warns UnitsWarning of a shear longer than the volume is wide, which is likely in another unit, and
+    UnlikelyWarning of other values that are likely wrong.
     """
     path = Path(path)
+    _check_no_images(path)
     try:
         values, included = values_of(path)
     except ValueError as error:
@@ -38,7 +41,19 @@ def load(path: str | os.PathLike[str]) -> Config:
     if config.data is not None and not config.data.files:
         raise ConfigError(f"{source}: missing key data.path")
     _warn_of_long_shears(config, path)
+    for line in (*unlikely(config), *degrees_in_radians(values)):
+        warnings.warn(f"{path}: {line}", UnlikelyWarning, stacklevel=2)
     return config
+
+
+def _check_no_images(path: Path) -> None:
+    """Raise ConfigError for what holds images instead of a configuration, with the command that makes one of them."""
+    suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
+    kind = "a folder" if path.is_dir() else "an image" if path.name.lower().endswith(suffixes) else None
+    if kind is not None and path.exists():
+        raise ConfigError(
+            f"{path}: is {kind}, not a configuration; torchdic new {path} --out run.toml writes one for a stack"
+        )
 
 
 def parse(content: bytes, source: str) -> Config:
@@ -47,15 +62,15 @@ def parse(content: bytes, source: str) -> Config:
     Relative paths stay as they are. Raises ConfigError as `load` does.
     """
     try:
-        values = tomllib.loads(decoded(content))
-    except ValueError as error:  # TOMLDecodeError is one
-        raise ConfigError(f"{source}: is not TOML: {error}") from error
+        values = values_in(content)
+    except ValueError as error:
+        raise ConfigError(f"{source}: {error}") from error
     return _configuration(values, source)
 
 
 def _configuration(values: dict[str, Any], source: str) -> Config:
     """The configuration of a file's values. Raises ConfigError as `load` does."""
-    wrong = wrong_unit(values)
+    wrong = impossible(values)
     if wrong is not None:
         raise ConfigError(f"{source}: {wrong}")
     try:

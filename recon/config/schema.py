@@ -23,6 +23,10 @@ class UnitsWarning(UserWarning):
     """A value in a configuration is so large that another unit was likely meant."""
 
 
+class UnlikelyWarning(UserWarning):
+    """A value in a configuration may be right, but is likely wrong."""
+
+
 @dataclass(frozen=True)
 class VolumeSection:
     """The volume that is simulated or reconstructed.

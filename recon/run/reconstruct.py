@@ -20,12 +20,13 @@ from recon.recording.preparation import Measured
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data, load_support
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, descend_recorded
 from recon.run.results import INTERRUPTED, METRICS, Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
-from torchdic.files.whole import written_whole
 
 # Without a [fidelity] section. Newton's steps are computed with few directions and corrected to these images, whose
 # error is below the noise of 40 000 photons a pixel; each of Adam's many steps is computed with its own in full, and
@@ -51,9 +52,9 @@ def reconstruct(
     resume: go on from the checkpoint in `out`, if there is one; a finished run goes on where more steps are asked for.
     restart: begin anew although there are a checkpoint or results.
     misfit: makes the misfit that is lowered from the prepared stack (prism, focus, y, x); None is the configuration's.
-    Raises ConfigError, StackError and CheckpointError for bad input and ShortOfMemoryError where there is no room for
-    the descent, before `out` is touched; InterruptedRunError on Ctrl-C, with a checkpoint and the volume so far saved;
-    ResultsError where results cannot be written.
+    Raises ConfigError, StackError and CheckpointError for bad input, FinishedError where `out` holds results, and
+    ShortOfMemoryError where there is no room for the descent, before `out` is touched; InterruptedRunError on Ctrl-C,
+    with a checkpoint and the volume so far saved; ResultsError where results cannot be written.
     """
     config = spelled_out(config)
     measured = load_data(config)
@@ -80,17 +81,6 @@ def reconstruct(
         return write_results(out, config, measured, problem, ended, sections)
     except ResultsError as error:
         raise ResultsError(f"{error}{'; make room and go on with --resume' if kept else ''}") from error
-
-
-def prepare_folder(out: Path) -> None:
-    """Make sure that `out` is a folder that can be written to. Raises ConfigError."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with written_whole(out / ".writable"):
-            pass
-        (out / ".writable").unlink()
-    except OSError as error:
-        raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
 
 
 def spelled_out(config: Config) -> Config:
@@ -162,7 +152,7 @@ def _digest(array: np.ndarray) -> str:
 def _checkpoint_to_resume(out: Path, identity: str, *, resume: bool) -> Checkpoint | None:
     """The checkpoint to go on from, None to begin in a folder without one.
 
-    Raises CheckpointError where the folder holds an earlier run, and the user must choose.
+    Raises CheckpointError or FinishedError where the folder holds an earlier run, and the user must choose.
     """
     saved, finished = out / CHECKPOINT, (out / METRICS).exists() and not (out / INTERRUPTED).exists()
     if saved.exists():
@@ -175,7 +165,5 @@ def _checkpoint_to_resume(out: Path, identity: str, *, resume: bool) -> Checkpoi
         )
         raise CheckpointError(f"{saved}: {which}, or begin anew with --restart")
     if finished:
-        raise CheckpointError(
-            f"{out / METRICS}: the folder has results; name another one, or replace them with --restart"
-        )
+        check_no_results(out, (METRICS,), restart=False)
     return None

@@ -23,8 +23,8 @@ _Images = tuple[tuple[tuple[float, ...], ...], tuple[float, ...]]
 class Otherwise:
     """An acquisition that may have been meant instead of the declared one.
 
-    name: of the mistake, or of the mistakes, in a word or two. what: in words. advice: what to do. mistakes: how many
-    there are; 0 is as declared.
+    name: of the mistake, or of the mistakes, in a few words, with the order in which prisms are tried. what: in words.
+    advice: what to do. mistakes: how many there are; 0 is as declared.
     """
 
     name: str
@@ -187,14 +187,17 @@ def _reversed(declared: Acquisition) -> Otherwise:
 
 def _reordered(declared: Acquisition, order: list[int] | tuple[int, ...]) -> Otherwise:
     """Image i was recorded with the declared prism order[i]."""
-    moved = [i for i, place in enumerate(order) if i != place]
+    moved = [i + 1 for i, place in enumerate(order) if i != place]
     if len(moved) == 2:
-        what, advice = f"prisms {moved[0]} and {moved[1]} (from 0) are exchanged", "exchange them in acquisition.prisms"
+        first, second = moved
+        name, what = f"prisms {first}↔{second}", f"prisms {first} and {second} (from 1) are exchanged"
+        advice = "exchange them in acquisition.prisms"
     else:
-        what = f"the prisms (from 0) are in the order {', '.join(map(str, order))}"
-        advice = f"put acquisition.prisms in the order {', '.join(map(str, order))}"
+        places = ", ".join(str(i + 1) for i in order)
+        name, what = f"prisms in order {places}", f"the prisms (from 1) are in the order {places}"
+        advice = f"put acquisition.prisms in the order {places}"
     acquisition = Acquisition([declared.prisms[i] for i in order], declared.focus)
-    return Otherwise("prisms", what, advice, acquisition, 1 if len(moved) == 2 else 2)
+    return Otherwise(name, what, advice, acquisition, 1 if len(moved) == 2 else 2)
 
 
 def _together(declared: Acquisition, steps: list[Otherwise]) -> Otherwise:

@@ -78,6 +78,10 @@ class Orders:
             value, loss = (part / (self.noise or 1.0) for part in (tried.misfit, tried.loss))
             mark = "  ←" if tried.otherwise is self.chosen else ""
             lines.append(f"{tried.otherwise.name:{max(width, 19)}}  {value:14.3f}  {loss:11.3f}  {tried.rounds}{mark}")
+        if any("prisms" in tried.otherwise.name for tried in shown):
+            lines.append(
+                "(prisms: of acquisition.prisms, from 1; in order 2, 1 the first images were recorded with prism 2)"
+            )
         if len(self.tried) > most:
             lines.append(f"and {len(self.tried) - most} others, which explain less")
         return "\n".join(lines)

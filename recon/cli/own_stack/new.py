@@ -1,46 +1,22 @@
 """torchdic new: a configuration from a recorded stack, in which every value says where it comes from."""
 
 import argparse
-import math
-import os
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
+from recon.cli.own_stack.options import Given, add_options, given_of, in_radians
+from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
+from recon.config.including import seen_from
+from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
-from recon.config.schema import ConfigError
-from recon.config.units import wrong_unit
 from recon.recording.stuck_pixels import sharpest
 from recon.recording.survey.survey import Survey, survey
 from torchdic import Microscope, Objective
 from torchdic.files.gathered import Gathered, gather
 from torchdic.files.stack import write_stack
 from torchdic.files.whole import write_text
-
-# Options in µm, degrees or without unit, each with its help.
-OPTIONS = {
-    "pixel-size": "side of a camera's pixel in the specimen, µm",
-    "z-step": "distance between focus planes, µm",
-    "wavelength": "of the light in vacuum, µm",
-    "na": "numerical aperture of the objective",
-    "condenser-na": "numerical aperture of the condenser, as far as it is open",
-    "background": "refractive index of the medium around the specimen",
-    "shear": "length of the shear, µm",
-    "shear-angle": "direction of the shear in degrees, from right towards down",
-    "bias": "phase between the beams in degrees",
-}
-
-
-# Where a configuration holds a length, whose unit is checked there.
-_AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
-    "wavelength": lambda value: {"microscope": {"wavelength": value}},
-    "pixel_size": lambda value: {"volume": {"pixel_size": value}},
-    "z_step": lambda value: {"volume": {"slice_thickness": value}},
-    "shear": lambda value: {"acquisition": {"prisms": [{"shear": {"length": value}}]}},
-}
 
 # A pixel in µm, of which no spot of light fills one alone.
 SMALL = 0.05
@@ -53,34 +29,30 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="RUN.toml", help="configuration file to write")
     parser.add_argument("--series", type=int, metavar="N", help="which of several stacks in the file, counted from 0")
-    for name, words in OPTIONS.items():
-        parser.add_argument(f"--{name}", type=float, metavar="X", help=words)
+    add_options(parser)
     parser.add_argument("--lower", action="store_true", help="the specimen's index is below its medium's")
 
 
 def run(options: argparse.Namespace) -> None:
     """Write a configuration for a stack and print what is in it, and what is assumed."""
-    if options.out.exists():
-        raise ConfigError(f"{options.out}: is there already, and isn't overwritten; choose another name or remove it")
-    if options.out.suffix.lower() != ".toml":
-        raise ConfigError(f"{options.out}: the configuration's name must end in .toml")
+    check_out(options.out, options.stack)
+    given = given_of(options)
     gathered = gather(options.stack, options.series)
-    given = {name.replace("-", "_"): getattr(options, name.replace("-", "_")) for name in OPTIONS}
-    check_given(given)
     found, settled = look(gathered, {**given, "lower": options.lower})
-    joined = None if gathered.one_file else options.out.with_name(f"{options.out.stem}.stack.ome.tif")
-    if joined is not None and joined.exists():
-        raise ConfigError(f"{joined}: is there already, and isn't overwritten; choose another name for {options.out}")
+    joined = None if gathered.one_file else joined_beside(options.out)
+    if joined is not None:
+        check_not_there([joined])
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
-    path = _from(options.out, data if joined is None else joined)
+    path = seen_from(options.out.parent, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
-    parse(text.encode(), str(options.out))  # what the user gave may break a law
+    config = parse(text.encode(), str(options.out))  # what the user gave may break a law
     options.out.parent.mkdir(parents=True, exist_ok=True)
     if joined is not None:
         _join(gathered, settled, joined)
     write_text(options.out, text)
     print(summary(options.out, gathered, found, settled))
-    for line in warnings_of(gathered, found, settled):
+    likely_wrong = [*in_radians(given), *(f"warning: {line}" for line in unlikely(config))]
+    for line in (*warnings_of(gathered, found, settled), *likely_wrong):
         print(f"  {line}")
     print(
         f"\nCorrect what is assumed in {options.out}. Then torchdic calibrate {options.out} --out DIR finds what the "
@@ -88,21 +60,7 @@ def run(options: argparse.Namespace) -> None:
     )
 
 
-def check_given(given: Mapping[str, float | None]) -> None:
-    """Raise ConfigError for an option that breaks its law, or that can't be in its unit."""
-    for name, value in given.items():
-        option = f"--{name.replace('_', '-')}"
-        if value is None or (math.isfinite(value) and name in ("bias", "shear_angle")):
-            continue
-        least = 1.0 if name == "background" else 0.0
-        if not (value >= least and 0 < value < math.inf):
-            raise ConfigError(f"{option} {value:g} must be {'at least 1' if least else 'above 0'}, and finite")
-        wrong = wrong_unit(_AS_KEYS[name](value)) if name in _AS_KEYS else None
-        if wrong is not None:
-            raise ConfigError(f"{option}: {wrong.partition(': ')[2]}")
-
-
-def look(gathered: Gathered, given: dict[str, float | None]) -> tuple[Survey, Settled]:
+def look(gathered: Gathered, given: Given) -> tuple[Survey, Settled]:
     """What the images tell, and the values of a configuration."""
     said, pixel = gathered.setup, gathered.stack.pixel_size
     microscope = Microscope(
@@ -113,15 +71,6 @@ def look(gathered: Gathered, given: dict[str, float | None]) -> tuple[Survey, Se
     size = (side, side) if side else pixel or (SMALL, SMALL)
     found = survey(gathered.stack, sharpest(microscope, size, background))
     return found, settle(gathered, found, given)
-
-
-def _from(configuration: Path, file: Path) -> str:
-    """A file's path as the configuration names it: from its folder where that is shorter."""
-    try:
-        relative = os.path.relpath(file.resolve(), configuration.resolve().parent)
-    except ValueError:  # another drive
-        return str(file.resolve())
-    return Path(relative).as_posix()
 
 
 def _join(gathered: Gathered, settled: Settled, path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from recon.cli.arguments import decimal
 from recon.cli.own_stack.phase_figure import draw_phase
 from recon.config.schema import ConfigError
 from recon.earlier.one_image import phase_of_image
@@ -18,7 +19,8 @@ from recon.recording.survey.direction import ShearDirection, shear_direction
 from recon.recording.survey.focus import sharpest_plane
 from recon.recording.survey.survey import flattened_planes
 from recon.report import figures
-from recon.run.reconstruct import prepare_folder
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 from torchdic.errors import StackError
 from torchdic.files.gathered import gather
 from torchdic.files.stack import write_stack
@@ -40,17 +42,15 @@ UNKNOWN = (
 def arguments(parser: argparse.ArgumentParser) -> None:
     """The image, and what may be known of it."""
     parser.add_argument("image", type=Path, nargs="+", metavar="IMAGE", help="an image, or a stack or folder of planes")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     parser.add_argument("--series", type=int, metavar="N", help="which of several stacks in the file, counted from 0")
     parser.add_argument("--setting", type=int, default=1, metavar="N", help="prism setting, counted from 1")
     parser.add_argument("--plane", type=int, metavar="N", help="focus plane, counted from 1; the sharpest without it")
-    parser.add_argument("--shear-angle", type=float, metavar="X", help="degrees, from right towards down")
+    parser.add_argument("--shear-angle", type=decimal, metavar="X", help="degrees, from right towards down")
 
 
 def run(options: argparse.Namespace) -> None:
     """Find the phase and leave it in the folder as phase.ome.tif, phase.png and phase.json."""
-    if (options.out / FACTS).exists():
-        raise ConfigError(f"{options.out / FACTS}: the folder has a phase; name another one")
+    check_no_results(options.out, (FACTS,), restart=options.restart)
     stack = gather(options.image, options.series).stack
     settings, planes, ny, nx = stack.data.shape
     _check_number("--setting", options.setting, settings)

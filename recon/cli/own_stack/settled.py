@@ -4,13 +4,19 @@ import cmath
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from recon.config.commented import Sourced
+from recon.config.schema import ConfigError
+from recon.recording.survey.dark_counts import DarkCounts
 from recon.recording.survey.survey import SettingSurvey, Survey
+from torchdic.files.format import Stack
 from torchdic.files.gathered import Gathered
 
 # Values that nobody has said: green light, a dry objective of high aperture, a watery medium, a quarter wave of bias.
 WAVELENGTH, NA, BACKGROUND, _BIAS_DEGREES, _ANGLE_DEGREES = 0.55, 0.9, 1.335, 90.0, 45.0
+
+ANGLE = "shear's angle"
 
 # Slices are no thicker than this many µm: light bends within them.
 _THICKEST = 1.0
@@ -30,7 +36,8 @@ class Settled:
     """All values of a configuration, each with its origin.
 
     prisms: (length, angle in degrees, bias in degrees) of each setting. slices: of the volume, (number, spacing in µm).
-    first: depth of the first plane in µm. lower: whether the specimen's index is below its medium's.
+    first: depth of the first plane in µm. offset: counts in the dark; None where the images are no counts.
+    lower: whether the specimen's index is below its medium's.
     """
 
     pixel_size: Sourced
@@ -42,6 +49,7 @@ class Settled:
     prisms: tuple[tuple[Sourced, Sourced, Sourced], ...]
     slices: tuple[int, float]
     first: float
+    offset: Sourced | None
     lower: bool
 
     @property
@@ -50,13 +58,13 @@ class Settled:
         angles = [angle for _, angle, _ in self.prisms]
         lengths, biases = [length for length, _, _ in self.prisms], [bias for _, _, bias in self.prisms]
         all_of_them = (*lengths, *angles, *biases, self.na, self.condenser_na, self.background, self.wavelength)
-        steps = [self.step] if self.first else []
-        named = [one.name for one in (*all_of_them, self.pixel_size, *steps) if one.origin == "assumed"]
+        steps, offsets = [self.step] if self.first else [], [] if self.offset is None else [self.offset]
+        named = [one.name for one in (*all_of_them, *offsets, self.pixel_size, *steps) if one.origin == "assumed"]
         others = [*(["order of the planes"] if self.first else []), *([] if self.lower else ["sign of Δn"])]
         return list(dict.fromkeys([*named, *others]))
 
 
-def settle(gathered: Gathered, found: Survey, given: Mapping[str, float | None]) -> Settled:
+def settle(gathered: Gathered, found: Survey, given: Mapping[str, Any]) -> Settled:
     """Choose each value.
 
     given: by the user, under the names of the command's options; None or missing is not given.
@@ -89,6 +97,7 @@ def settle(gathered: Gathered, found: Survey, given: Mapping[str, float | None])
         prisms=_prisms(found, given, round(wavelength.value / (2 * reach), 2)),
         slices=slices_of(planes, step.value, depth, pixel.value),
         first=round(-(planes - 1) / 2 * step.value, 6),
+        offset=_offset(stack, found.camera, given.get("offset")),
         lower=bool(given.get("lower")),
     )
 
@@ -121,9 +130,20 @@ def _chosen(given: float | None, said: float | None, guess: float, name: str, wh
     return Sourced(guess, "assumed", why, name)
 
 
-def _prisms(
-    found: Survey, given: Mapping[str, float | None], usual: float
-) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
+def _offset(stack: Stack, camera: DarkCounts | None, given: float | None) -> Sourced | None:
+    """The counts of a dark image."""
+    name = "camera's offset"
+    if given is not None:
+        return Sourced(float(given), "given", "counts in the dark", name)
+    if not stack.is_integer:
+        return None
+    if camera is not None and camera.offset_is_seen:
+        why = f"± {camera.offset_error:.0f}, from how noise grows with light; counts in the dark"
+        return Sourced(float(round(camera.offset)), "measured", why, name)
+    return Sourced(0.0, "assumed", "the counts of a dark image, which these images don't show", name)
+
+
+def _prisms(found: Survey, given: Mapping[str, Any], usual: float) -> tuple[tuple[Sourced, Sourced, Sourced], ...]:
     """Length, angle and bias of each setting's shear; the first bias along an axis is taken as above 0.
 
     A setting much darker than the brightest has bias 0, and the axis of the one before it: its images don't show any.
@@ -138,11 +158,44 @@ def _prisms(
             places.append((places[-1][0] if places else 0, 0.0))
         else:
             places.append(_place(setting, axes, places))
-    lower, told = bool(given.get("lower")), given.get("shear_angle")
-    angles = [_angle(axis, None if number else told, lower=lower) for number, axis in enumerate(axes)]
+    shown = [_angle(axis, lower=bool(given.get("lower"))) for axis in axes]
+    told = _told_angles(given.get("shear_angle") or (), places, len(axes))
+    angles = [shown[axis] if angle is None else angle for (axis, _), angle in zip(places, told, strict=True)]
+    places = _as_told(places, told)
     dark = replace(size, value=0.0, origin="measured", why="its empty field is dark beside another setting's")
     biases = [replace(size, value=sign * size.value) if sign else dark for _, sign in places]
-    return tuple((length, angles[axis], bias) for (axis, _), bias in zip(places, biases, strict=True))
+    return tuple((length, angle, bias) for angle, bias in zip(angles, biases, strict=True))
+
+
+def _told_angles(told: Sequence[float], places: Sequence[tuple[int, float]], axes: int) -> list[Sourced | None]:
+    """The angle of each setting as far as the user gave it: one for each axis, or one for each setting.
+
+    A single one is of the first axis. places: number of the axis, and sign of the bias, of each setting. axes: how many
+    there are. Raises ConfigError for another number of angles.
+    """
+    if len(told) == axes or len(told) <= 1:
+        given = [told[axis] if axis < len(told) else None for axis, _ in places]
+    elif len(told) == len(places):
+        given = list(told)
+    else:
+        counts = f"{axes} axes of shear" if axes > 1 else "one axis of shear"
+        raise ConfigError(
+            f"--shear-angle {' '.join(f'{angle:g}' for angle in told)}: {len(told)} angles, and the images show "
+            f"{counts} in {len(places)} prism settings: give one for each axis, or one for each setting"
+        )
+    return [None if angle is None else Sourced(float(angle), "given", name=ANGLE) for angle in given]
+
+
+def _as_told(places: Sequence[tuple[int, float]], told: Sequence[Sourced | None]) -> list[tuple[int, float]]:
+    """The settings' axes and signs of bias; of those on one axis whose angles are given reversed the signs are, too."""
+    first: dict[int, float] = {}
+    turned = []
+    for (axis, sign), angle in zip(places, told, strict=True):
+        if angle is not None:
+            apart = math.radians(angle.value - first.setdefault(axis, angle.value))
+            sign = sign if math.cos(apart) >= 0 else -sign
+        turned.append((axis, sign))
+    return turned
 
 
 @dataclass
@@ -194,16 +247,13 @@ def _likely(setting: SettingSurvey, places: Sequence[tuple[int, float]]) -> tupl
     return max(others)[1:]
 
 
-def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
+def _angle(axis: _Axis, *, lower: bool) -> Sourced:
     """The angle of an axis in degrees, from what its settings show together.
 
     Its uncertainty is that of their weighted mean, or half of how far they are apart where that is more.
     """
-    name = "shear's angle"
-    if told is not None:
-        return Sourced(float(told), "given", name=name)
     if not axis.shown:
-        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", name)
+        return Sourced(_ANGLE_DEGREES, "assumed", "the images show none; from dark edge to bright", ANGLE)
     mean = sum(axis.shown)
     beside = max(abs(math.degrees(cmath.phase(one / mean))) for one in axis.shown)
     sure = max(math.degrees(1 / math.sqrt(sum(map(abs, axis.shown)))), beside / 2)
@@ -212,4 +262,4 @@ def _angle(axis: _Axis, told: float | None, *, lower: bool) -> Sourced:
         why = f"± {sure:.0f}°, if Δn is {'below' if lower else 'above'} 0 and the bias between 0° and 180°"
     else:
         why = f"± {sure:.0f}°, or the opposite: the images don't show which"
-    return Sourced(round(degrees % 360, 1), "measured", why, name)
+    return Sourced(round(degrees % 360, 1), "measured", why, ANGLE)

@@ -1,7 +1,7 @@
 """What `torchdic new` prints: a short table of what it found, and what it assumed."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from recon.cli.own_stack.settled import Settled
@@ -62,6 +62,8 @@ def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[R
     if stack.is_integer:
         bits = stack.bits or 8 * stack.data.dtype.itemsize
         yield "camera", f"{bits} bits", "file" if stack.bits else "file (of its pixels)"
+    if settled.offset is not None:
+        yield "camera's offset", f"{settled.offset.value:g}{unit}", settled.offset.origin
     levels, noises = [s.level for s in found.settings], [s.noise for s in found.settings if s.noise is not None]
     yield "background", f"{_range(levels)}{unit}", "measured"
     uneven = max(setting.unevenness for setting in found.settings)
@@ -98,10 +100,27 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
         yield f"the planes' brightness differs by {flicker:.1%}; it is fitted"
     if found.saturated > _SATURATED * gathered.stack.data.size:
         yield f"warning: {found.saturated / gathered.stack.data.size:.1%} of the pixels are saturated"
-    told = settled.prisms[0][1]
-    seen = found.settings[0].direction
-    if told.origin == "given" and seen is not None and seen.signed:
-        degrees = math.degrees(seen.angle) + (180 if settled.lower else 0)
+    yield from _of_given_angles(found, settled)
+
+
+def _of_given_angles(found: Survey, settled: Settled) -> Iterator[str]:
+    """What the images say against the angles that were given, and which settings none was given for."""
+    angles = [angle for _, angle, _ in settled.prisms]
+    given = {angle.value: None for angle in angles if angle.origin == "given"}
+    others = [number for number, angle in enumerate(angles) if angle.origin != "given"]
+    if given and others:
+        alone, other = next(iter(given)), angles[others[0]]
+        yield (
+            f"--shear-angle {alone:g} is of the first axis alone; settings {_listed(others)} have another one, "
+            f"{other.value:g}° ({other.origin}); to give both: --shear-angle {alone:g} {other.value:g}"
+        )
+    for (_, told, bias), setting in zip(settled.prisms, found.settings, strict=True):
+        seen = setting.direction
+        if told.value not in given or bias.value == 0 or seen is None or not seen.signed:
+            continue
+        del given[told.value]  # one line for settings that share it
+        turned = settled.lower != (bias.value < 0)
+        degrees = math.degrees(seen.angle) + (180 if turned else 0)
         apart = abs((degrees - told.value + 180) % 360 - 180)
         if apart > 90:
             yield (
@@ -110,6 +129,11 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
             )
         elif apart > max(3 * math.degrees(seen.uncertainty), 10):
             yield f"warning: the images show the shear along {degrees % 360:.0f}°, {told.value:g}° is given"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Settings counted from 1."""
+    return " and ".join(filter(None, [", ".join(str(n + 1) for n in numbers[:-1]), str(numbers[-1] + 1)]))
 
 
 def _range(values: list[float]) -> str:

@@ -30,7 +30,7 @@ def template(gathered: Gathered, found: Survey, settled: Settled, path: str, ser
         "acquisition": _acquisition(gathered, found, settled),
         "microscope": _microscope(settled),
         "volume": _volume(gathered, settled),
-        "data": _data(gathered, found, path, series),
+        "data": _data(gathered, found, settled, path, series),
         "reconstruction": _reconstruction(gathered, settled),
     }
     return commented(head, top, tables)
@@ -38,6 +38,10 @@ def template(gathered: Gathered, found: Survey, settled: Settled, path: str, ser
 
 def _line(key: str, value: Sourced) -> Line:
     return Line(key, value.value, value.comment)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def _acquisition(gathered: Gathered, found: Survey, settled: Settled) -> list[Line]:
@@ -86,23 +90,20 @@ def _volume(gathered: Gathered, settled: Settled) -> list[Line]:
     ]
 
 
-def _data(gathered: Gathered, found: Survey, path: str, series: int | None) -> list[Line]:
+def _data(gathered: Gathered, found: Survey, settled: Settled, path: str, series: int | None) -> list[Line]:
     lines = [Line("path", path, "given" if gathered.one_file else f"given: {len(gathered.files)} files, joined")]
     if series is not None:
         lines.append(Line("series", series, "given"))
     stack, camera = gathered.stack, found.camera
+    if settled.offset is not None:
+        lines.append(_line("offset", settled.offset))
     if not stack.is_integer:
         lines.append(Line("scale", "background", "chosen: floats, whose empty field is taken as the model's"))
         return lines
-    if camera is not None and camera.offset_is_seen:
-        why = f"measured: ± {camera.offset_error:.0f}, from how noise grows with light; counts in the dark"
-        lines.append(Line("offset", float(round(camera.offset)), why))
-    else:
-        lines.append(Line("offset", 0.0, "assumed: the counts of a dark image, which these images don't show"))
     if camera is not None:
         sure = f"measured: ± {camera.gain_error / camera.gain:.0%}, counts per electron"
-        lines.append(Line("gain", camera.gain, sure))
-        lines.append(Line("read_noise", camera.read, "assumed: 2 electrons, in counts"))
+        lines.append(Line("gain", _short(camera.gain), sure))
+        lines.append(Line("read_noise", _short(camera.read), "chosen: 2 electrons in counts, as is usual"))
     return lines
 
 

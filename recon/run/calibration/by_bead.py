@@ -10,13 +10,17 @@ from torch import Tensor
 from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
 from recon.calibration.optics import firsts_of
 from recon.config.schema import BeadSection, Config, ConfigError
-from recon.run.calibration.found import FoundQuantity, Value, plain, rounded, rounded_shear
+from recon.run.calibration.found import DIRECTION, FoundQuantity, Value, plain, rounded, rounded_angle, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
+from recon.run.data import camera_pixels
 from torchdic import Acquisition
 from torchdic.scalar import number
 
 # Planes of the stack, and µm of light around the bead on each side, that its fit takes.
 PLANES, AROUND = 7, 3.5
+
+# The least size of the field over the bead's.
+ROOM = 1.2
 
 # A fit that leaves more than this many times the noise's misfit, and this share of the contrast, isn't explained.
 POOR, LEAST = 1.5, 0.02
@@ -33,15 +37,9 @@ def by_bead(
 ) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The stack with what its bead tells of the optics, and each quantity.
 
-    Raises ConfigError where the field is no larger than the bead, or the bead isn't found in it.
+    Raises ConfigError where the bead isn't found in the field.
     """
-    config = stack.config
-    pixel, extent = min(stack.pixels.spacing[1:]), min(stack.pixels.extent[1:])
-    if extent < 1.2 * bead.width:
-        raise ConfigError(
-            f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
-            "the images must show the bead and some of the medium around it"
-        )
+    config, pixel = stack.config, min(stack.pixels.spacing[1:])
     part = stack.part(math.ceil((bead.width + 2 * AROUND) / pixel), PLANES)
     model = model_of(part, bead, config.volume.background, config.microscope)
     print(f"the optics behind the bead, by {part.data.shape[0]} × {part.data.shape[1]} of its images …", flush=True)
@@ -52,11 +50,24 @@ def by_bead(
     return stack.with_config(_calibrated(config, found)), _quantities(config, found, part.planes)
 
 
+def check_bead(config: Config, section: BeadSection) -> None:
+    """Raise ConfigError where the field is no larger than the bead, or where aberrations are sought of no objective."""
+    extent = min(camera_pixels(config).extent[1:])
+    if extent < ROOM * 2 * section.radius:
+        raise ConfigError(
+            f"calibration.bead.radius: {section.radius:g} µm is too large for a field of {extent:g} µm: "
+            "the images must show the bead and some of the medium around it"
+        )
+    terms = list(config.calibration.aberrations)
+    if terms and config.microscope.objective is None:
+        raise ConfigError(f"calibration.aberrations: {terms} are of an objective, and microscope.objective isn't given")
+
+
 def _calibrated(config: Config, found: OpticsFound) -> Config:
     """The configuration with the optics that were found."""
     acquisition, microscope = found.setup.acquisition, found.setup.microscope
     prisms = [
-        None if prism is None else replace(rounded_shear(prism), bias=rounded(prism.bias, 5))
+        None if prism is None else replace(rounded_shear(prism), bias=rounded_angle(prism.bias))
         for prism in acquisition.prisms
     ]
     condenser, objective = config.microscope.condenser, config.microscope.objective
@@ -126,10 +137,10 @@ def _shears(config: Config, found: OpticsFound, how: str) -> list[FoundQuantity]
     deviations = found.deviations["shear"]
     lengths, angles = ([rounded(value, 5) for value in values] for values in zip(*now, strict=True))
     sure = plain(torch.tensor(lengths) * deviations[:, 0].cpu(), 2)
-    note = f"{how}; from +x towards +y (down)"
+    note = f"{how}; from right towards down"
     return [
         FoundQuantity("shear's length", "µm", [length for length, _ in told], lengths, sure, how),
-        FoundQuantity("shear's angle", "rad", [a for _, a in told], angles, plain(deviations[:, 1], 2), note),
+        FoundQuantity(DIRECTION, "rad", [a for _, a in told], angles, plain(deviations[:, 1], 2), note),
     ]
 
 

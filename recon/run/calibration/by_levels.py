@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from recon.calibration.levels import UNSURE, biases_of_levels
-from recon.run.calibration.found import FoundQuantity, rounded
+from recon.run.calibration.found import FoundQuantity, rounded, rounded_angle
 from recon.run.calibration.stack import CalibrationStack
 from torchdic.scalar import number
 
@@ -38,7 +38,7 @@ def by_levels(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuan
     else:
         return stack, []
     changed = [
-        prism if prism is None or bias is None else replace(prism, bias=rounded(bias, 5))
+        prism if prism is None or bias is None else replace(prism, bias=rounded_angle(bias))
         for prism, bias in zip(prisms, biases, strict=True)
     ]
     calibrated = replace(config, acquisition=replace(config.acquisition, prisms=changed))

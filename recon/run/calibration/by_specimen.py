@@ -10,7 +10,7 @@ from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
-from recon.run.calibration.found import FoundQuantity, left, plain, rounded, rounded_shear
+from recon.run.calibration.found import DIRECTION, FoundQuantity, left, plain, rounded, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
 from torchdic import Acquisition
 from torchdic.scalar import number
@@ -40,7 +40,7 @@ def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationSt
     names = _untold(stack.config, known)
     if not can_be_tried(beside.problem(beside.setup)):
         why = "no prism has a linear response, without which no volume can be fitted beside it"
-        return stack, [left(name, "", None, why) for name in ("shear's angle", "condenser na")] + names
+        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na")] + names
     print("the shear's direction and the condenser's aperture, by volumes that are fitted with several …", flush=True)
     beside = beside.held()
     stack, angles = _angles(stack, beside)
@@ -73,14 +73,14 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
     config = stack.config
     found = find_angles(beside)
     told = [math.atan2(number(p.shear[0]), number(p.shear[1])) for p in firsts_of(config.acquisition)]
-    name, unit = "shear's angle", "rad"
+    name, unit = DIRECTION, "rad"
     if max(least.deviation for least in found) > UNSURE_ANGLE:
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
         return stack, left(name, unit, told, why)
     turned = torch.tensor([[1.0, least.value] for least in found], dtype=torch.float64)
     values = [rounded(t + least.value, 5) for t, least in zip(told, found, strict=True)]
     sure = [rounded(math.hypot(least.deviation, MODEL_ANGLE), 2) for least in found]
-    how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from +x towards +y (down)"
+    how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from right towards down"
     unknown = ShearOfAxes(axes_of(config.acquisition))
     made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
     prisms = [None if prism is None else rounded_shear(prism) for prism in made.prisms]

@@ -1,22 +1,24 @@
 """From a configuration and its stack to a calibrated configuration: signs and orders first, then values."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from recon.calibration.known_specimen import ModelledSpecimen
 from recon.calibration.trials.orders import Orders
+from recon.config.rewritten import Source
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.fit.bounds import Bounds
-from recon.run.calibration.by_bead import by_bead
+from recon.run.calibration.by_bead import by_bead, check_bead
 from recon.run.calibration.by_levels import by_levels
 from recon.run.calibration.by_specimen import by_specimen
-from recon.run.calibration.found import FoundQuantity
+from recon.run.calibration.found import Calibration, FoundQuantity
 from recon.run.calibration.stack import CalibrationStack
-from recon.run.calibration.written import write_calibration
-from recon.run.reconstruct import prepare_folder
+from recon.run.calibration.written import RESULTS, write_calibration
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
 
 # What no image tells, whatever is fitted.
 GAUGES = (
@@ -35,27 +37,32 @@ ASSUMED = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """What a calibration found. config: with the found values. orders: None where they couldn't be tried."""
-
-    config: Config
-    orders: Orders | None
-    found: tuple[FoundQuantity, ...]
-
-
-def calibrate(config: Config, out: Path, device: torch.device, bead: ModelledSpecimen | None = None) -> Calibration:
+def calibrate(
+    config: Config,
+    out: Path,
+    device: torch.device,
+    bead: ModelledSpecimen | None = None,
+    *,
+    source: Source | None = None,
+    restart: bool = False,
+) -> Calibration:
     """Find what the stack's images tell of the optics, and leave calibrated.toml and calibration.json in a folder.
 
     bead: the one that [calibration] names, where it names one. A line is printed for each quantity, and a table of the
     signs and orders.
-    Raises ConfigError and StackError for bad input, before `out` is touched.
+    source: of the configuration's file, whose keys and comments calibrated.toml keeps.
+    restart: replace what an earlier calibration has left there.
+    Raises ConfigError and StackError for bad input, and FinishedError where the folder has a calibration, before `out`
+    is touched.
     """
+    check_no_results(out, RESULTS, restart=restart)
     section = config.calibration.bead
     if (section is None) != (bead is None):
         raise ConfigError("calibration.bead: a bead is fitted where the configuration names one, and only there")
     if all(prism is None for prism in config.acquisition.prisms):
         raise ConfigError("acquisition.prisms: all images are bright field: there is no shear or bias to calibrate")
+    if section is not None:
+        check_bead(config, section)
     stack = CalibrationStack.read(config, device)
     prepare_folder(out)
     orders = stack.orders(bounds_of(config))
@@ -77,7 +84,7 @@ def calibrate(config: Config, out: Path, device: torch.device, bead: ModelledSpe
         print(quantity.words)
     print(f"not told by any image: {'; '.join(GAUGES)}")
     calibration = Calibration(_known(stack.config, found), orders, tuple(found))
-    write_calibration(out, calibration.config, orders, found, GAUGES, with_microscope=bead is not None)
+    write_calibration(out, config, calibration, GAUGES, source or Source(), with_microscope=bead is not None)
     return calibration
 
 

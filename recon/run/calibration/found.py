@@ -7,8 +7,14 @@ from typing import Any
 
 import torch
 
+from recon.calibration.trials.orders import Orders
+from recon.config.schema import Config
+from recon.config.spelling import direction
 from torchdic import Prism
 from torchdic.scalar import number
+
+# The quantity that is a direction.
+DIRECTION = "shear's angle"
 
 # A value, or one for each prism, axis, image, …
 Value = Any
@@ -49,7 +55,20 @@ class FoundQuantity:
 
     def _short(self, value: Value, digits: int = 4) -> str:
         """A value in a line, angles in degrees."""
-        return _short(_in_degrees(value) if self.unit == "rad" else value, digits)
+        if self.unit != "rad":
+            return _short(value, digits)
+        # of a direction, not of how sure it is, a full turn makes no difference: as `torchdic new` writes it
+        turns = self.name == DIRECTION and value is not self.uncertainty
+        return _short(_in_degrees(value, 360 if turns else None), digits)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a calibration found. config: with the found values. orders: None where they couldn't be tried."""
+
+    config: Config
+    orders: Orders | None
+    found: tuple[FoundQuantity, ...]
 
 
 def left(name: str, unit: str, before: Value, why: str) -> FoundQuantity:
@@ -63,9 +82,15 @@ def rounded(value: Any, digits: int) -> float:
 
 
 def rounded_shear(prism: Prism) -> Prism:
-    """A prism whose shear and axis have five significant digits; its bias stays as it is."""
-    y, x = (rounded(part, 5) for part in prism.shear)
-    return replace(prism, shear=(y, x), axis=None if prism.axis is None else rounded(prism.axis, 5))
+    """A prism whose shear has five significant digits of length and degrees, as its axis; its bias stays as it is."""
+    y, x = map(number, prism.shear)
+    shear = direction(rounded(math.hypot(y, x), 5), rounded(math.degrees(math.atan2(y, x)), 5))
+    return replace(prism, shear=shear, axis=None if prism.axis is None else rounded_angle(prism.axis))
+
+
+def rounded_angle(angle: Any) -> float:
+    """An angle in rad that has five significant digits in degrees, in which configurations hold it."""
+    return math.radians(rounded(math.degrees(number(angle)), 5))
 
 
 def plain(value: torch.Tensor, digits: int = 6) -> Value:
@@ -89,10 +114,13 @@ def _short(value: Value, digits: int = 4) -> str:
     return ", ".join(f"{number:.{digits}g}" for number in numbers)
 
 
-def _in_degrees(value: Value) -> Value:
+def _in_degrees(value: Value, turn: float | None = None) -> Value:
+    """The same in degrees. turn: the values are counted from 0 to it."""
     if isinstance(value, dict):
-        return {name: _in_degrees(part) for name, part in value.items()}
-    return [_in_degrees(part) for part in value] if isinstance(value, list) else math.degrees(value)
+        return {name: _in_degrees(part, turn) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_in_degrees(part, turn) for part in value]
+    return math.degrees(value) if turn is None else math.degrees(value) % turn
 
 
 def _numbers(value: Value) -> list[float] | None:

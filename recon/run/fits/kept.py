@@ -15,6 +15,7 @@ from recon.report.fit_fronts import write_fits
 from recon.report.fit_trial import FitCandidate, FitTrial
 from recon.run.checkpoint import CheckpointError
 from recon.run.fits.trials import Recorded
+from recon.run.folder.results import check_no_results
 from torchdic.files.whole import write_json
 
 FITS = "fits.json"
@@ -34,7 +35,7 @@ class KeptTrials:
         """Take over what an interrupted run has left.
 
         Raises CheckpointError where the user must choose between both, the file can't be read, or it holds another
-        stack's or configuration's trials.
+        stack's or configuration's trials, and FinishedError where it holds all trials of a finished run.
         """
         path = self.out / FITS
         if restart or not path.exists():
@@ -47,7 +48,7 @@ class KeptTrials:
             raise CheckpointError(f"{path}: holds no trials of this version: {error}; --restart replaces it") from error
         if not resume:
             if complete:
-                return
+                check_no_results(self.out, (FITS,), restart=False)
             raise CheckpointError(
                 f"{path}: {len(trials)} fits of an interrupted run; go on with --resume or begin anew with --restart"
             )

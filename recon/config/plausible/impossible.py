@@ -1,4 +1,4 @@
-"""Values in a wrong unit: lengths in nm, mm or m instead of µm, and angles in degrees instead of rad."""
+"""Values that can't be: in a wrong unit, such as nm for µm or degrees for rad, or an index of no medium."""
 
 import math
 import re
@@ -20,10 +20,10 @@ _BEYOND = 10
 
 @dataclass(frozen=True)
 class _Plausible:
-    """The sizes that a quantity can have, in µm or rad; 0 is none of a size.
+    """The sizes that a quantity can have, in µm, rad or without unit; 0 is none of a size.
 
     keys: a regular expression of the keys that hold the quantity. what: its name. each: whether each number of an array
-    has to reach the lowest size, or the largest of them alone.
+    has to reach the lowest size, or the largest of them alone. likely: what it is usually below, where it has no unit.
     """
 
     keys: str
@@ -32,6 +32,7 @@ class _Plausible:
     highest: float
     unit: str = "µm"
     each: bool = False
+    likely: float = math.inf
 
     def problem(self, key: str, numbers: dict[str, float]) -> str | None:
         """What is wrong with a key's numbers, each with its place in the key; None where they may be right."""
@@ -41,17 +42,20 @@ class _Plausible:
             tiny = 0 < size < self.lowest and (self.each or largest < self.lowest)
             if tiny or size > self.highest:
                 meant = self._meant(number, key)
-                return f"{key}{place}: {number:g} {self.unit} is no {self.what} {self._limits()}{meant}"
+                return f"{key}{place}: {_with(number, self.unit)} is no {self.what} {self._limits()}{meant}"
         return None
 
     def _limits(self) -> str:
         if self.lowest == 0:
-            return f"(at most {self.highest:g} {self.unit})"
-        return f"({self.lowest:g} to {self.highest:g} {self.unit})"
+            return f"(at most {_with(self.highest, self.unit)})"
+        return f"({self.lowest:g} to {_with(self.highest, self.unit)})"
 
     def _meant(self, number: float, key: str) -> str:
         if self.unit == "°":
             return ""
+        if not self.unit:
+            slipped = next((number / ten for ten in _SLIPS if abs(number) / ten < self.likely), None)
+            return "" if slipped is None else f"; is the decimal point in the wrong place? {slipped:.6g} would do"
         if self.unit == "rad":
             last = key.rpartition(".")[2]
             other = f", or {last}{DEGREES} = {number:g}" if last in ANGLES else ""
@@ -61,6 +65,14 @@ class _Plausible:
                 return f"; lengths are in µm: {number:g} {unit} are {number * factor:.6g} µm"
         return "; lengths are in µm"
 
+
+def _with(number: float, unit: str) -> str:
+    return f"{number:g} {unit}".rstrip()
+
+
+# The highest index of a transparent medium, with room above germanium's 4.0 and lead telluride's 5.7; the greatest
+# difference of two; and by what factors a decimal point slips.
+HIGHEST, DIFFERENCE, _SLIPS = 6.0, 5.0, (10, 100, 1000)
 
 _PRISM = r"acquisition\.prisms\[\d+\]\."
 
@@ -74,6 +86,7 @@ _QUANTITIES = (
     ),
     _Plausible(r"volume\.(spacing|slice_thickness)", "size of a voxel", 1e-3, 100, each=True),
     _Plausible(r"microscope\.camera\.pixel_size", "size of a pixel", 1e-3, 100),
+    _Plausible("z_step", "distance between focus planes", 1e-3, 100),  # an option of `torchdic new`
     _Plausible(rf"{_PRISM}shear(\.length)?", "shear", 1e-4, 20),
     _Plausible(rf"{_PRISM}({'|'.join(ANGLES)}|shear\.angle){DEGREES}", "angle of at most a turn", 0, 360, "°"),
     _Plausible(rf"{_PRISM}focal_length", "focal length of an objective", 100, 1e6),
@@ -90,6 +103,23 @@ _QUANTITIES = (
         "rad",
     ),
     _Plausible(r"microscope\.objective\.aberrations\.\d+", "aberration of a lens", 0, 60, "rad"),
+    _Plausible(
+        r"(volume|specimen)\.background|calibration\.bead\.index|microscope\.objective\.layer\.(index|design_index)"
+        r"|microscope\.objective\.layer\.(medium|design)",
+        "refractive index of a transparent medium",
+        0,
+        HIGHEST,
+        "",
+        likely=2.0,
+    ),
+    _Plausible(
+        r"reconstruction\.bounds\.(lower|upper)|specimen\.(.*\.)?contrast",
+        "difference of two refractive indices",
+        0,
+        DIFFERENCE,
+        "",
+        likely=1.0,
+    ),
 )
 
 # A pixel may be coarse, but not as coarse as a slice.
@@ -101,12 +131,12 @@ _OF_SPECIMENS = (
 )
 
 
-def wrong_unit(values: dict[str, Any]) -> str | None:
-    """What is wrong with the first value that can't be in its unit, with its key and the value in that unit, or None.
+def impossible(values: dict[str, Any]) -> str | None:
+    """What is wrong with the first value that can't be, with its key and what may be meant, or None.
 
     values: of a configuration file, as TOML holds them. Values of a wrong type are passed over.
     """
-    known = dict(_numbers(values))
+    known = dict(numbers_in(values))
     quantities = (*_QUANTITIES, _focus(known), *_of_the_specimen(known))
     for key, numbers in known.items():
         if key in ("volume.spacing", "volume.pixel_size"):
@@ -144,14 +174,14 @@ def _extent(known: dict[str, dict[str, float]]) -> list[float]:
     return [n * d for n, d in zip(shape, sides, strict=True)] if len(shape) == len(sides) == 3 else []
 
 
-def _numbers(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:
+def numbers_in(value: Any, key: str = "") -> Iterator[tuple[str, dict[str, float]]]:
     """Each key with its number, or with the numbers of its array by their place in it."""
     if isinstance(value, dict):
         for name, below in value.items():
-            yield from _numbers(below, f"{key}.{name}" if key else name)
+            yield from numbers_in(below, f"{key}.{name}" if key else name)
     elif isinstance(value, list) and any(isinstance(below, dict) for below in value):
         for index, below in enumerate(value):
-            yield from _numbers(below, f"{key}[{index}]")
+            yield from numbers_in(below, f"{key}[{index}]")
     else:
         array = {f"[{i}]": below for i, below in enumerate(value)} if isinstance(value, list) else {"": value}
         found = {place: float(number) for place, number in array.items() if _is_finite_number(number)}

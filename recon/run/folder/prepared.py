@@ -1,0 +1,27 @@
+"""A folder that results are to be written into."""
+
+import os
+from pathlib import Path
+
+from recon.config.schema import ConfigError
+from torchdic.files.whole import written_whole
+
+
+def check_folder(out: Path) -> None:
+    """Raise ConfigError where `out` can't become a folder to write to, as where it is a file. Nothing is touched."""
+    there = next(folder for folder in (out, *out.absolute().parents) if os.path.exists(folder))
+    if not there.is_dir():
+        raise ConfigError(f"{out}: can't be written to: {there} is a file, not a folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"{out}: can't be written to: no permission to write in {there}")
+
+
+def prepare_folder(out: Path) -> None:
+    """Make sure that `out` is a folder that can be written to. Raises ConfigError."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with written_whole(out / ".writable"):
+            pass
+        (out / ".writable").unlink()
+    except OSError as error:
+        raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error

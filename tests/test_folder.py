@@ -1,0 +1,98 @@
+"""The folder of a run: a file in its place is seen first, and results are replaced only where the user says so."""
+
+import argparse
+
+import pytest
+
+from recon.cli import main
+from recon.cli.commands import COMMANDS
+from recon.config.schema import ConfigError
+from recon.run.folder.prepared import check_folder, prepare_folder
+from recon.run.folder.results import FinishedError, check_no_results
+
+# Of each command the files that a finished run leaves, each of which it would replace.
+LEAVES = {
+    "demo": ("comparison.png", "comparison.json"),
+    "simulate": ("stack.ome.tif",),
+    "phase": ("phase.json",),
+    "calibrate": ("calibrated.toml", "calibration.json", "microscope.toml"),
+    "work-precision": ("work_precision.json",),
+}
+# Commands whose folder takes more than one look: what is interrupted goes on.
+RESUMED = {"reconstruct"}
+# It takes a few seconds, and prints all that it leaves.
+REPEATED = {"plan"}
+
+
+def said_no(capsys, *words):
+    """The one line with which a command refuses."""
+    try:
+        code = main([str(word) for word in words])
+    except SystemExit as exit_:
+        code = exit_.code
+    assert code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def typed(command, tmp_path, out):
+    """A command whose input doesn't matter where its folder is refused."""
+    return (command, *([] if command == "demo" else [tmp_path / "in.toml"]), "--out", out)
+
+
+def test_every_command_with_a_folder_is_looked_at_here():
+    parsers = {name: argparse.ArgumentParser() for name in COMMANDS}
+    for name, parser in parsers.items():
+        for add in COMMANDS[name].arguments:
+            add(parser)
+    dirs = {n for n, p in parsers.items() if any(a.dest == "out" and a.metavar == "DIR" for a in p._actions)}
+    assert dirs == set(LEAVES) | RESUMED | REPEATED
+
+
+@pytest.mark.parametrize("command", [*LEAVES, *RESUMED, *REPEATED])
+def test_a_file_in_the_folders_place_is_seen_before_anything_is_read(tmp_path, capsys, command):
+    (tmp_path / "file").write_text("precious")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        line = said_no(capsys, *typed(command, tmp_path, out))
+        assert f"{out}: can't be written to: {tmp_path / 'file'} is a file, not a folder" in line
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+@pytest.mark.parametrize(("command", "name"), [(c, name) for c, names in LEAVES.items() for name in names])
+def test_results_are_not_replaced_unasked(tmp_path, capsys, command, name):
+    (tmp_path / "in.toml").write_text("[volume]\n[data]")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("precious")
+    if command == "calibrate":
+        (tmp_path / "in.toml").write_text(CONFIG)
+    line = said_no(capsys, *typed(command, tmp_path, tmp_path / "out"))
+    assert f"{name}: the folder has results; name another one, or replace them with --restart" in line
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
+
+
+CONFIG = """
+volume = { shape = [2, 8, 8], spacing = [1.0, 0.2, 0.2], background = 1.4 }
+microscope = { wavelength = 0.5, objective = { na = 0.8 }, condenser = { na = 0.5 } }
+acquisition = { prisms = [{ shear = [0.0, 0.2], bias = 1.5 }] }
+data = { path = "missing.tif" }
+"""
+
+
+def test_only_results_stand_in_the_way_and_only_unasked(tmp_path):
+    check_no_results(tmp_path, ("a.json", "b.json"), restart=False)
+    (tmp_path / "b.json").write_text("{}")
+    check_no_results(tmp_path, ("a.json",), restart=False)
+    check_no_results(tmp_path, ("a.json", "b.json"), restart=True)
+    with pytest.raises(FinishedError, match=r"b\.json: the folder has results"):
+        check_no_results(tmp_path, ("a.json", "b.json"), restart=False)
+
+
+def test_a_folder_is_looked_at_without_being_made(tmp_path):
+    check_folder(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    prepare_folder(tmp_path / "a" / "b")
+    check_folder(tmp_path / "a" / "b")
+    (tmp_path / "file").touch()
+    for prepare in (check_folder, prepare_folder):
+        with pytest.raises(ConfigError, match="can't be written to"):
+            prepare(tmp_path / "file" / "b")
