@@ -11,7 +11,7 @@ from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
-from recon.report.causes import seen_in_residual, tried, variants
+from recon.report.causes import Cause, ranked, seen_in_residual, tried, variants
 from recon.report.verdict import LIMIT, PoorFitWarning, Verdict, judged, leaves_too_much
 from recon.run.results import tell
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
@@ -101,6 +101,35 @@ def test_a_variant_differs_from_all_others(data):
 def test_what_newton_cannot_fit_is_not_tried(data):
     assert can_be_tried(problem_of(data))
     assert not can_be_tried(problem_of(data, microscope=Microscope(0.546, condenser_prism=False)))
+
+
+@pytest.mark.parametrize(("name", "rest"), [("sign", "reverse acquisition.focus"), ("focus", "reverse the sign of")])
+def test_the_advice_to_reverse_names_what_else_gives_the_same_images(data, name, rest):
+    """Of shears, planes and Δn's sign all three reversed are a gauge, see tests/test_laws.py."""
+    advice = {v.name: v.advice for v in variants(problem_of(data))}[name]
+    assert f"or, with the same images, {rest}" in advice
+    assert 'set reconstruction.bounds = { lower = "none", upper = 0 } (images' in advice
+    free = {v.name: v.advice for v in variants(problem_of(data, bounds=Bounds(None, None)))}[name]
+    assert f"or, with the same images, {rest}" in free
+    assert "bounds" not in free
+
+
+def test_what_is_assumed_is_advised_first(data):
+    assumed = {v.name: v.advice for v in variants(problem_of(data), ("sign of Δn",))}["focus"]
+    assert assumed.startswith("reverse the sign of every shear and set reconstruction.bounds")
+    assert "or, with the same images, reverse acquisition.focus" in assumed
+    known, near, doubted = Cause("axes", 0.9, "", ""), Cause("focus", 0.85, "", ""), Cause("focus", 0.5, "", "")
+    assert ranked([known, near], ("order of the planes",)) == (near, known)
+    assert ranked([known, near]) == (known, near)
+    assert ranked([known, doubted], ("order of the planes",)) == (known, doubted)
+
+
+@pytest.mark.parametrize("stacked", [True, False])
+def test_a_planes_order_is_advised_only_where_there_are_planes(data, stacked):
+    planes = slice(None) if stacked else slice(1, 2)
+    acquisition = sheared(*SHEARS, focus=FOCUS[planes])
+    advice = {v.name: v.advice for v in variants(problem_of(data[:, planes], acquisition))}["sign"]
+    assert ("focus" in advice) is stacked
 
 
 # causes that the residual shows
@@ -194,3 +223,13 @@ def test_a_volume_that_follows_the_noise_is_told():
 
 def test_free_bounds_are_told():
     assert "Δn's sign is free" in Verdict(0.13, 0.13, 1.0, free=True).words
+
+
+def test_a_sign_that_is_assumed_is_told_beside_the_volume_that_explains_the_stack():
+    words = Verdict(0.13, 0.13, 1.0, assumed=("bias", "sign of Δn")).words
+    assert words.endswith("; so does −Δn with reversed shears and planes: sign of Δn is assumed")
+    assert "−Δn" not in Verdict(0.13, 0.13, 1.0, assumed=("bias",)).words
+
+
+def test_without_a_cause_what_is_assumed_is_to_be_checked_first():
+    assert "check what is assumed (bias), then pixel size" in Verdict(0.5, 0.13, 1.0, assumed=("bias",)).words

@@ -20,7 +20,7 @@ from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Row
 from recon.fit.unknowns import IndexDifference
 from recon.prior.weight import FALLING, whiteness
-from recon.report.causes import Cause, ranked, seen_in_residual, tried
+from recon.report.causes import DOUBTS, ORDER, SIGN, Cause, ranked, seen_in_residual, tried
 
 # Misfit over noise's above which a volume doesn't explain its stack, if LEAST of the specimen's contrast is unexplained
 # as well: without noise, voxels and directions leave some 0.05 %. Right fits of the benchmarks end at 0.99 to 1.05.
@@ -49,7 +49,7 @@ class Verdict:
     misfit, noise: of the volume, and what noise leaves; None where that isn't known. white: see
     `recon.prior.weight.whiteness`; 1 is white. causes: what may be wrong, the likeliest first; empty where the volume
     explains the stack. free: whether the bounds leave the sign of Δn free. expected: whether the method's images are
-    expected to come down to the noise.
+    expected to come down to the noise. assumed: what nobody has said, by the names of a configuration's `assumed`.
     """
 
     misfit: float
@@ -58,6 +58,7 @@ class Verdict:
     causes: tuple[Cause, ...] = ()
     free: bool = False
     expected: bool = True
+    assumed: tuple[str, ...] = ()
 
     @property
     def ratio(self) -> float | None:
@@ -106,22 +107,34 @@ class Verdict:
             return "a method without a descent leaves that much even where all is right; 'newton' explains more"
         if self.poor:
             return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
-        free = "; Δn's sign is free: reversed shears and planes give the same images with −Δn" if self.free else ""
+        free = self._gauge()
         if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
             return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
         if self.noise is None:
             return f"it explains {self.explained:.1%} of the contrast, residual {residual}{free}"
         return f"the volume explains the stack{free}"
 
+    def _gauge(self) -> str:
+        """What explains the stack as well, where nobody has said that it isn't so."""
+        if self.free:
+            return "; Δn's sign is free: reversed shears and planes give the same images with −Δn"
+        doubted = [name for name in (SIGN, ORDER) if name in self.assumed]
+        if not doubted:
+            return ""
+        are = "are" if len(doubted) > 1 else "is"
+        return f"; so does −Δn with reversed shears and planes: {' and '.join(doubted)} {are} assumed"
+
     def _likeliest(self) -> str:
         if not self.causes:
+            checked = ", ".join(self.assumed)
             return (
-                "no single cause was found: check pixel size, focus step, wavelength, apertures, shear and bias, "
-                "and try learn = ['bias', 'drift']"
+                f"no single cause was found: check {f'what is assumed ({checked}), then ' if checked else ''}"
+                "pixel size, focus step, wavelength, apertures, shear and bias, and try learn = ['bias', 'drift']"
             )
         first, *others = self.causes
         named = f"; or {', '.join(dict.fromkeys(cause.name for cause in others[:2]))}" if others else ""
-        return f"most likely: {first.name} ({first.reason}): {first.advice}{named}"
+        assumed = "; it is assumed" if DOUBTS.get(first.name) in self.assumed else ""
+        return f"most likely: {first.name} ({first.reason}{assumed}): {first.advice}{named}"
 
     def as_json(self) -> dict[str, Any]:
         """The verdict as metrics.json holds it."""
@@ -155,18 +168,20 @@ def judged(
     noise: Sequence[float] | None,
     method: str,
     rows: Sequence[Row],
+    assumed: Sequence[str] = (),
 ) -> Verdict:
     """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
 
     images: the model's, of the last step. noise: standard deviation of each prism's, None where it isn't known.
-    method: that found the volume. rows: of the log.
+    method: that found the volume. rows: of the log. assumed: what nobody has said, by the names of a configuration's
+    `assumed`.
     """
     misfit = float(problem.misfit(images))
     alone = problem.misfit.of_noise(noise) if noise is not None or problem.misfit.knows_all else None
     index = next((unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference)), None)
     free = index is not None and _free(index.bounds)
     white = whiteness(images, problem.misfit)
-    found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT)
+    found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT, assumed=tuple(assumed))
     if not found.poor or not found.expected:
         return found
     return replace(found, causes=_causes(problem, images, found, rows))
@@ -182,11 +197,11 @@ def _causes(problem: Problem, images: Tensor, found: Verdict, rows: Sequence[Row
             print("the misfit is far above the noise's: short fits of what may have been declared wrongly …")
             try:
                 with torch.enable_grad():
-                    for cause in tried(problem, found.misfit, noise):
+                    for cause in tried(problem, found.misfit, noise, found.assumed):
                         causes.append(cause)
             except KeyboardInterrupt:  # the volume is found and is still to be written
                 print("the search for causes was interrupted")
-    return ranked(causes)
+    return ranked(causes, found.assumed)
 
 
 def _unfinished(rows: Sequence[Row]) -> list[Cause]:

@@ -122,7 +122,7 @@ def write_results(
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured, config.reconstruction.method)
-    verdict = judged(problem, images, measured.noise, config.reconstruction.method, ended.rows)
+    verdict = judged(problem, images, measured.noise, config.reconstruction.method, ended.rows, config.assumed)
     found["verdict"] = verdict.as_json()
     tell(verdict)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
