@@ -106,7 +106,8 @@ def seen_in_residual(
             "brightness",
             min(1.0, level / excess),
             "the residual is uniform within each image",
-            "fit the brightness (method 'newton' or 'adam'), or flatten the stack (data.flatten = true)",
+            "bring the stack to the model's level (data.scale = 'background', data.flatten = true), or correct what "
+            "sets it: the bias of each prism and the apertures (na)",
         )
     if margin == 0:
         yield from _cut(squares.mean((0, 1)), noise)
