@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from recon.config.schema import Config, ConfigError, DataSection
-from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.newton.weak_hessian import lacks_of_linear_response
 from recon.fit.problem import DIRECT
 from recon.fit.setup import on_voxels, pixels_of
 from recon.misfit.base import spatial_variance
@@ -133,20 +133,15 @@ def check_feasible(config: Config) -> None:
         )
     if method == "opl" and config.reconstruction.support is not None:
         raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
-    section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
-    if section.method in ("newton", "linear"):
-        asks, instead = f"reconstruction.method: {section.method!r} needs", "use method 'adam' with start 'zero'"
-    elif section.method == "adam" and section.start == "linear":
+    if method in ("newton", "linear"):
+        asks, instead = f"reconstruction.method: {method!r} needs", "use method 'adam' with start 'zero'"
+    elif method == "adam" and config.reconstruction.start == "linear":
         asks, instead = "reconstruction.start: 'linear' needs", "use 'zero'"
     else:
         return
-    if sheared and not config.microscope.condenser_prism:
-        raise ConfigError(f"{asks} a condenser prism, microscope.condenser_prism is false; {instead}")
-    if config.microscope.lenses is not None:
-        raise ConfigError(f"{asks} a linear transfer, which can't hold microscope.polarisation.pupil; {instead}")
-    if section.method != "adam" and not responds_linearly(config.microscope, config.acquisition):
-        biases = ", ".join(f"{float(prism.bias):g}" for prism in sheared)
-        raise ConfigError(f"{asks} a linear response, acquisition.prisms have biases {biases}: {instead}")
+    lacking = lacks_of_linear_response(config.microscope, config.acquisition, dark=method == "adam")
+    if lacking is not None:
+        raise ConfigError(f"{asks} {lacking}; {instead}")
 
 
 def _warn_of_dark_field(config: Config) -> None:
