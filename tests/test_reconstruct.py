@@ -368,7 +368,7 @@ def test_a_pixel_size_that_disagrees_is_warned_of_and_the_configs_wins(other, wo
     assert code == 0
     assert err.count("torchdic: warning: ") == 1
     assert "0.3 × 0.21 µm" in err
-    assert "the config's are used" in err
+    assert "the config's are used; correct volume.spacing or pixel_size if the file is right" in err
     assert read_volume(tmp_path / "out" / "volume.ome.tif")[1] == GRID
 
 

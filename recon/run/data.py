@@ -52,7 +52,7 @@ def prepared(config: Config, stack: Stack) -> Measured:
         focus=tuple(float(focus) for focus in config.acquisition.focus),
         pixel_size=pixels.spacing[1:],
         pixels=pixels.shape[1:],
-        field=config.volume.grid.extent[1:] if pixels is not config.volume.grid else None,
+        field=config.volume.grid.extent[1:] if pixels != config.volume.grid else None,
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
