@@ -194,6 +194,14 @@ def test_the_volume_is_float32_with_the_voxel_size(workplace):
     assert [int(pixels.get(f"Size{axis}")) for axis in "ZYX"] == list(GRID.shape)
 
 
+def test_a_range_that_ends_at_minus_0_ends_at_0():
+    assert [f"{value:g}" for value in results.summary(torch.tensor([[[-0.02, -0.0]]])).values()] == [
+        "-0.02",
+        "0",
+        "-0.01",
+    ]
+
+
 def test_the_volume_is_the_specimen_as_far_as_it_can_be_seen(workplace):
     truth = GaussianBall(0.5, 0.02, 1.5, (0.3, -0.3, 0.4)).delta(GRID, dtype=torch.float32)
     found = volume(workplace / "whole")
