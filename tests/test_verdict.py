@@ -8,12 +8,14 @@ import torch
 
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report.causes import Cause, ranked, seen_in_residual, tried, variants
+from recon.report.metrics import coarse_residual
 from recon.report.verdict import LIMIT, PoorFitWarning, Verdict, judged, leaves_too_much
-from recon.run.results import tell
+from recon.run.results import model_images, tell
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 GRID = Grid((6, 24, 22), (0.5, 0.2, 0.2))
@@ -130,6 +132,31 @@ def test_a_planes_order_is_advised_only_where_there_are_planes(data, stacked):
     acquisition = sheared(*SHEARS, focus=FOCUS[planes])
     advice = {v.name: v.advice for v in variants(problem_of(data[:, planes], acquisition))}["sign"]
     assert ("focus" in advice) is stacked
+
+
+@pytest.mark.parametrize("name", ["right", "mirrored y", pytest.param("sign", marks=pytest.mark.slow)])
+def test_a_small_noisy_stack_with_a_reversed_axis_is_not_explained(images, name):
+    """A wild volume brings its misfit to the noise's, by following the noise; the right one isn't warned of."""
+    level = 5 * NOISE
+    noisy = images + level * torch.randn(images.shape, generator=torch.Generator().manual_seed(1))
+    setup = Setup(empty_medium(GRID, 1.335, noisy), MICROSCOPE, MISTAKES.get(name, TRUE))
+    problem = Problem.from_recipe(noisy, setup, Fidelity(sources=18), Recipe(), noise=[level] * 2)
+    steps = list(minimise(problem))
+    found = judged(problem, model_images(problem, steps[-1]), [level] * 2, "newton", [step.row for step in steps])
+    assert not leaves_too_much(found.misfit, found.noise)
+    assert found.poor is (name != "right")
+    assert [cause.name for cause in found.causes[:1]] == ([] if name == "right" else [name])
+    assert ("another explains the stack better; most likely" in found.words) is found.poor
+
+
+def test_white_noise_has_a_coarse_residual_of_1_and_structure_more():
+    noise = torch.randn(2, 3, 60, 60, generator=torch.Generator().manual_seed(0))
+    rows, columns = noise * 0.1, torch.sin(torch.arange(60) / 4.0)
+    assert coarse_residual(rows, [0.1, 0.1]) == pytest.approx(1, abs=0.1)  # two of its standard deviations
+    # means over three pixels keep (sin 3w/sin w/3)² = 0.92 of the wave's power 1/2, at w = 1/8
+    expected = 9 * 0.5 * 0.01 * (math.sin(3 / 8) / math.sin(1 / 8) / 3) ** 2 / 0.01
+    assert coarse_residual(0.1 * columns.expand(2, 3, 60, 60), [0.1, 0.1]) == pytest.approx(expected, rel=0.1)
+    assert coarse_residual(rows[..., :2], [0.1, 0.1]) == 1.0
 
 
 # causes that the residual shows

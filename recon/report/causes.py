@@ -176,19 +176,22 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
 # --- what short fits show ---------------------------------------------------------------------------------------------
 
 
-def tried(problem: Problem, misfit: float, noise: float, assumed: Sequence[str] = ()) -> Iterator[Cause]:
+def tried(
+    problem: Problem, misfit: float, noise: float, assumed: Sequence[str] = (), sure: float = 0.0
+) -> Iterator[Cause]:
     """The causes that explain the stack better in a short fit than what was declared does.
 
     misfit: of the finished volume. noise: what noise leaves of it. assumed: what nobody has said, by the names of a
-    configuration's `assumed`. A fit whose light can't be followed explains nothing. Without priors any fit comes
-    closer, so that one must come closer than the finished one.
+    configuration's `assumed`. sure: part of the declared short fit's misfit by which another must be lower. A fit whose
+    light can't be followed explains nothing. Without priors any fit comes closer, so that one must come closer than the
+    finished one.
     """
     declared = short_fit(problem)
     for variant in variants(problem, assumed):
         found = short_fit(variant.problem)
         usual = misfit if variant.name == PRIORS else declared
         share = min(1.0, (usual - found) / max(usual - noise, 1e-12))
-        if share < LEAST:
+        if share < LEAST or usual - found < sure * usual:
             continue
         reason = f"a short fit so has a misfit of {found:.3g}, as declared {usual:.3g}"
         yield Cause(variant.name, share, f"{variant.what}: {reason}", variant.advice)
