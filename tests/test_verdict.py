@@ -260,3 +260,12 @@ def test_a_sign_that_is_assumed_is_told_beside_the_volume_that_explains_the_stac
 
 def test_without_a_cause_what_is_assumed_is_to_be_checked_first():
     assert "check what is assumed (bias), then pixel size" in Verdict(0.5, 0.13, 1.0, assumed=("bias",)).words
+
+
+def test_a_volume_that_is_full_of_the_other_sign_is_told(images, data, truth):
+    """The ball less its own Δn everywhere gives the same images: a specimen above the medium, bounds below it."""
+    rows = [(n, 0.5, 0.5, 1.0) for n in range(20)]
+    problem = problem_of(data, bounds=Bounds(None, 0.0))
+    found = judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth - truth.max())
+    assert "the volume explains the stack; more than half of the volume has a Δn of about -0.02: images" in found.words
+    assert "more than half" not in judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth).words

@@ -27,6 +27,10 @@ from recon.report.metrics import COARSE, coarse_residual
 # as well: without noise, voxels and directions leave some 0.05 %. Right fits of the benchmarks end at 0.99 to 1.05.
 LIMIT, LEAST = 1.1, 0.02
 
+# Where the median of Δn is more than this part of the largest |Δn|, most of the volume isn't the medium. The priors
+# leave it at 0 in a medium with specimens.
+FILLED = 0.25
+
 # Below it the volume has followed the noise.
 FOLLOWS = 0.9
 
@@ -58,6 +62,7 @@ class Verdict:
     `recon.prior.weight.whiteness`; 1 is white. causes: what may be wrong, the likeliest first; empty where the volume
     explains the stack. free: whether the bounds leave the sign of Δn free. expected: whether the method's images are
     expected to come down to the noise. assumed: what nobody has said, by the names of a configuration's `assumed`.
+    filled: the median of Δn where most of the volume isn't the medium; else None.
     """
 
     misfit: float
@@ -67,6 +72,7 @@ class Verdict:
     free: bool = False
     expected: bool = True
     assumed: tuple[str, ...] = ()
+    filled: float | None = None
 
     @property
     def ratio(self) -> float | None:
@@ -120,7 +126,7 @@ class Verdict:
             return f"the volume follows the noise, and another explains the stack better; {self._likeliest()}"
         if self.poor:
             return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
-        free = self._gauge()
+        free = self._gauge() + self._offset()
         if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
             return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
         if self.noise is None:
@@ -136,6 +142,15 @@ class Verdict:
             return ""
         are = "are" if len(doubted) > 1 else "is"
         return f"; so does −Δn with reversed shears and planes: {' and '.join(doubted)} {are} assumed"
+
+    def _offset(self) -> str:
+        """What a constant Δn may hide, where there is one."""
+        if self.filled is None:
+            return ""
+        return (
+            f"; more than half of the volume has a Δn of about {self.filled:.2g}: images don't tell a constant one, so "
+            "if that is the medium, Δn has the other sign (reconstruction.bounds)"
+        )
 
     def _likeliest(self) -> str:
         if not self.causes:
@@ -182,19 +197,21 @@ def judged(
     method: str,
     rows: Sequence[Row],
     assumed: Sequence[str] = (),
+    delta: Float[Tensor, "z y x"] | None = None,
 ) -> Verdict:
     """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
 
     images: the model's, of the last step. noise: standard deviation of each prism's, None where it isn't known.
     method: that found the volume. rows: of the log. assumed: what nobody has said, by the names of a configuration's
-    `assumed`.
+    `assumed`. delta: the volume's; None doesn't look at it.
     """
     misfit = float(problem.misfit(images))
     alone = problem.misfit.of_noise(noise) if noise is not None or problem.misfit.knows_all else None
     index = next((unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference)), None)
     free = index is not None and _free(index.bounds)
     white = whiteness(images, problem.misfit)
-    found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT, assumed=tuple(assumed))
+    filled = None if delta is None else _filling(delta)
+    found = Verdict(misfit, alone, white, (), free, method not in DIRECT, tuple(assumed), filled)
     if not found.expected:
         return found
     if found.poor:
@@ -253,6 +270,12 @@ def _unfinished(rows: Sequence[Row]) -> list[Cause]:
             reason = f"the last step lowered the misfit by {1 - last / before:.0%}"
             return [Cause(FEW, 0.3, reason, "let it take more: reconstruction.steps")]
     return []
+
+
+def _filling(delta: Float[Tensor, "z y x"]) -> float | None:
+    """The median of Δn where most of the volume isn't the medium; else None."""
+    median = float(delta.median())
+    return median if abs(median) > FILLED * float(delta.abs().max()) else None
 
 
 def _free(bounds: Bounds) -> bool:

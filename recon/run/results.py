@@ -127,7 +127,8 @@ def write_results(
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured, config.reconstruction.method)
-    verdict = judged(problem, images, measured.noise, config.reconstruction.method, ended.rows, config.assumed)
+    method = config.reconstruction.method
+    verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, delta)
     found["verdict"] = verdict.as_json()
     tell(verdict)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
