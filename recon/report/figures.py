@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 from torch import Tensor
 
 from torchdic import Grid, Prism
@@ -209,7 +209,7 @@ def scale_bar(ax: Axes, width: float, colour: str) -> None:
     bottom, top = ax.get_ylim()
     height = abs(bottom - top)
     # to be seen on any colour
-    around = [withStroke(linewidth=1, foreground="black" if colour == "white" else "white")]
+    around: list[AbstractPathEffect] = [withStroke(linewidth=1, foreground="black" if colour == "white" else "white")]
     bar = Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0)
     bar.set_path_effects(around)
     ax.add_patch(bar)
