@@ -67,6 +67,15 @@ def test_each_prism_shows_measured_modelled_and_residual(tmp_path, prisms, focus
     assert drawn(figure, tmp_path / "images.png").std() > 0.01
 
 
+def test_each_row_of_images_has_scales_of_grey_and_of_the_residual():
+    measured = torch.stack([torch.rand(3, 40, 50), 0.2 * torch.rand(3, 40, 50)])
+    figure = figures.draw_images(measured, measured * 0.9, PRISMS[:2], range(3), GRID)
+    greys = [ax for ax in figure.axes if ax.get_ylabel() == "intensity"]
+    for bar, row in zip(greys, measured, strict=True):
+        assert bar.get_ylim() == pytest.approx((float(row.min()), float(row.max())), abs=0.004)
+    assert sum(ax.get_ylabel() == "residual" for ax in figure.axes) == 2
+
+
 def test_a_perfect_model_has_a_residual_that_can_be_drawn(tmp_path):
     data = torch.rand(1, 1, 9, 12)
     drawn(figures.draw_images(data, data, PRISMS[:1], (0.0,), GRID), tmp_path / "images.png")
@@ -136,6 +145,7 @@ def test_sections_go_through_the_centre_of_the_specimen(tmp_path, spot):
     assert xy.images[0].get_extent() == pytest.approx([0, 3.0, 1.8, 0])
     assert xz.images[0].get_extent() == pytest.approx([0, 3.0, 2.0, 0])
     assert yz.images[0].get_extent() == pytest.approx([0, 1.8, 2.0, 0])
+    assert [ax.get_title(loc="right") for ax in (xy, xz, yz)] == ["z = −0.25 µm", "y = 0.4 µm", "x = −0.625 µm"]
     assert any(ax.get_ylabel() == "Δn" for ax in figure.axes)
     drawn(figure, tmp_path / "sections.png")
 

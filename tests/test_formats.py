@@ -89,7 +89,7 @@ def test_a_grey_png_is_one_plane(tmp_path):
         assert np.array_equal(read_stack(tmp_path / f"{name}.png").data[0, 0], grey)
     coloured = np.stack([grey, grey, grey[::-1]], -1)
     (tmp_path / "coloured.png").write_bytes(imagecodecs.png_encode(coloured))
-    with pytest.raises(StackError, match="is a colour image, 3 samples per pixel"):
+    with pytest.raises(StackError, match=r"is a colour image, 3 samples per pixel; .* in Fiji, Image > Type > 16-bit"):
         read_stack(tmp_path / "coloured.png")
     with pytest.raises(StackError, match="PNG can be read but not written"):
         write_stack(tmp_path / "out.png", grey)

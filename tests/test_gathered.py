@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from torchdic.errors import StackError
+from torchdic.errors import StackError, StackWarning
 from torchdic.files.described.setup import setup_in_words
 from torchdic.files.gathered import gather
 from torchdic.files.stack import read_stack, write_stack
@@ -80,29 +80,65 @@ def test_micro_managers_metadata_give_sizes_and_bits(tmp_path):
 
 
 def test_what_is_no_stack_of_files_is_refused_in_a_line(tmp_path):
-    empty, twice, odd = tmp_path / "empty", tmp_path / "twice", tmp_path / "odd"
+    empty, bare, twice, odd = (tmp_path / name for name in ("empty", "bare", "twice", "odd"))
     empty.mkdir()
     (empty / "notes.txt").write_text("no image")
+    bare.mkdir()
     planes(twice, lambda s, p: f"a{s}b{p}.tif")
     planes(odd, lambda _, p: f"plane{p}.tif", STACK[:1])
     tifffile.imwrite(odd / "plane3.tif", STACK[0, 0, :4])
     (odd / "plane4.tif").unlink()
     for paths, words in (
-        ([empty], r"empty: holds no images \(\.tif, "),
+        ([empty], r"empty: holds notes\.txt, but no images; a folder of planes has files that end in \.tif, "),
+        ([bare], "bare: is empty; a folder of planes has files that end in"),
         ([], "no stack is named"),
         ([odd, twice], "is a folder; give one folder, or files"),
-        ([odd], r"plane3\.tif: holds 1 × 1 × 4 × 6 uint16, plane0\.tif 1 × 1 × 5 × 6"),
+        ([odd], r"plane3\.tif: settings .* 1 × 1 × 4 × 6, but .*plane0\.tif has 1 × 1 × 5 × 6: the files of one stack"),
         ([twice], r"2 parts of the names change \(a0b0\.tif, a1b11\.tif\): name prism settings channel1"),
         ([tmp_path / "none.tif"], "no such file"),
     ):
         with pytest.raises(StackError, match=words) as caught:
             gather(paths)
         assert "\n" not in str(caught.value)
-    (twice / "z5.tif").touch()
-    planes(tmp_path / "gap", NAMES["c and z"])
-    (tmp_path / "gap" / "img_c1_z3.tif").unlink()
-    with pytest.raises(StackError, match="23 files are not 2 settings × 12 planes"):
-        gather([tmp_path / "gap"])
+
+
+def test_the_file_that_a_stack_of_settings_and_planes_lacks_is_named(tmp_path):
+    folder = planes(tmp_path / "gap", NAMES["micro-manager"])
+    (folder / "img_channel001_position000_time000000000_z003.tif").unlink()
+    said = r"23 files are not 2 settings × 12 planes: img_channel001_position000_time000000000_z003\.tif is missing"
+    with pytest.raises(StackError, match=said):
+        gather([folder])
+    twice = planes(tmp_path / "twice", NAMES["c and z"])
+    (twice / "img_c1_z03.tif").write_bytes((twice / "img_c1_z3.tif").read_bytes())
+    with pytest.raises(StackError, match=r"img_c1_z0?3\.tif and img_c1_z0?3\.tif are of one setting and plane"):
+        gather([twice])
+
+
+def test_a_plane_that_the_names_leave_out_is_warned_of(tmp_path):
+    """Every second plane is no gap."""
+    folder = planes(tmp_path / "planes", lambda _, p: f"cell z{p:02}.tif", STACK[:1])
+    (folder / "cell z03.tif").unlink()
+    with pytest.warns(
+        StackWarning, match=r"cell z03\.tif is missing between cell z02\.tif and cell z04\.tif; the planes"
+    ):
+        assert gather([folder]).stack.data.shape == (1, 11, 5, 6)
+    for plane in range(1, 12, 2):
+        (folder / f"cell z{plane:02}.tif").unlink(missing_ok=True)
+    assert gather([folder]).stack.data.shape == (1, 6, 5, 6)
+
+
+def test_a_jpeg_is_refused_with_how_to_export_it(tmp_path):
+    folder = tmp_path / "jpegs"
+    folder.mkdir()
+    imagecodecs = pytest.importorskip("imagecodecs")
+    (folder / "cell.jpg").write_bytes(imagecodecs.jpeg_encode(STACK[0, 0].astype(np.uint8)))
+    (folder / "cell.tif").write_bytes((folder / "cell.jpg").read_bytes())  # a JPEG by another name
+    for path in (folder / "cell.jpg", folder / "cell.tif"):
+        with pytest.raises(StackError, match=r"is a JPEG, whose compression has changed its greys; .* Save As > Tiff…"):
+            gather([path])
+    (folder / "cell.tif").unlink()
+    with pytest.raises(StackError, match=r"cell\.jpg: is a JPEG"):
+        gather([folder])
 
 
 # --- what files say ---------------------------------------------------------------------------------------------------

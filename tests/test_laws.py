@@ -423,6 +423,26 @@ def test_reversing_the_optical_axis_of_a_symmetric_setup_leaves_a_weak_image_mir
     assert float((up - down).abs().max()) < 0.02 * signal
 
 
+def test_shear_planes_and_the_sign_of_delta_n_reversed_together_are_a_gauge_and_no_two_of_them_are(propagation):
+    """To first order in Δn; the bias reversed is the shear reversed, exactly."""
+    grid = Grid((7, 32, 30), (0.4, 0.2, 0.2))
+    delta = GaussianBall(0.5, 1e-4, N0, (0.8, 0.4, -0.2)).delta(grid)
+    microscope = partially_coherent(torch.cat((POINTS, -POINTS[1:])))
+    focus = (-1.5, -0.5, 0.5, 1.5)
+
+    def of(sign, planes, shear=1, bias=1):
+        prisms = [Prism((0.0, shear * 0.24), bias * 1.2), Prism((shear * 0.24, 0.0), bias * 1.2)]
+        volume = Volume(grid, sign * (delta if planes > 0 else delta.flip(0)), N0)
+        return image(volume, microscope, Acquisition(prisms, focus[::planes]), Fidelity(propagation))
+
+    images = of(1, 1)
+    contrast = (images - math.sin(0.6) ** 2).norm()
+    assert (of(-1, -1, shear=-1) - images).norm() < 0.02 * contrast
+    torch.testing.assert_close(of(-1, -1, bias=-1), of(-1, -1, shear=-1), rtol=0, atol=1e-12)
+    for fewer in ((-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)):
+        assert (of(*fewer) - images).norm() > 0.5 * contrast, fewer
+
+
 # --- voxels --------------------------------------------------------------------------------------------------------
 
 

@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from recon.recording.background import background_surface, noise_level
-from recon.recording.preparation import ExpectedStack, Normalisation, prepare
+from recon.recording.preparation import ExpectedStack, Normalisation, check_counts, prepare
 from recon.recording.shear_axis import estimate_shear_axis
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
@@ -64,9 +64,26 @@ def test_prisms_and_planes_must_be_as_many_as_the_acquisition_says():
 
 def test_pixels_must_be_as_many_as_the_volumes():
     stack = Stack(np.ones((1, 1, 4, 6), np.float32), source="stack.tif")
-    with pytest.raises(StackError, match=r"stack\.tif has 4 × 6 pixels \(y × x\), the volume 6 × 4"):
+    with pytest.raises(
+        StackError, match=r"stack\.tif has 4 × 6 pixels \(y × x\), the volume 6 × 4; let volume\.shape end in 4, 6, or"
+    ):
         prepared(stack, [None], [0.0], (0.1, 0.1), pixels=(6, 4))
     assert prepared(stack, [None], [0.0], (0.1, 0.1), pixels=(4, 6)).data.shape == (1, 1, 4, 6)
+
+
+@pytest.mark.parametrize(
+    ("field", "advice"),
+    [
+        ((1.6, 2.4), "must be 1.2 × 1.8 µm (y × x), or microscope.camera.pixel_size 0.4 in the specimen"),
+        ((1.6, 1.6), "must be 1.2 × 1.8 µm (y × x)"),
+    ],
+    ids=["one pixel size fits", "none fits"],
+)
+def test_a_camera_whose_pixels_do_not_fill_the_volume_is_told_what_would(field, advice):
+    expected = ExpectedStack((1.5,), (0.0,), (0.3, 0.3), tuple(int(side / 0.3) for side in field), field=field)
+    with pytest.raises(StackError) as caught:
+        check_counts(Stack(np.ones((1, 1, 4, 6)), source="stack.tif"), expected)
+    assert str(caught.value).endswith(f"volume.shape × volume.spacing {advice}")
 
 
 @pytest.mark.parametrize(("shape", "planes"), [((8, 6), 1), ((3, 8, 6), 3)])

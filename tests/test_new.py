@@ -339,7 +339,7 @@ def test_a_folder_of_nothing_is_one_line(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     assert new(tmp_path / "empty", "--out", tmp_path / "run.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "empty: holds no images (.tif," in line
+    assert "empty: is empty; a folder of planes has files that end in .tif," in line
 
 
 def test_floats_are_scaled_by_their_background(tmp_path, recording):

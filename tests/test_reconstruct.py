@@ -29,9 +29,10 @@ from recon.misfit.gaussian import GaussianMisfit
 from recon.report import figures
 from recon.report.metrics import volume_error
 from recon.report.verdict import PoorFitWarning
-from recon.run import reconstruct, recorded
+from recon.run import reconstruct, recorded, results
 from recon.run.checkpoint import CheckpointError
-from torchdic import Grid, Volume, image
+from recon.run.data import load_data
+from torchdic import ApertureWarning, Grid, Volume, image
 from torchdic.files.stack import read_stack, read_volume, write_stack
 
 GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
@@ -191,6 +192,14 @@ def test_the_volume_is_float32_with_the_voxel_size(workplace):
     assert sizes == list(GRID.spacing)
     assert {pixels.get(f"PhysicalSize{axis}Unit", "µm") for axis in "ZYX"} == {"µm"}
     assert [int(pixels.get(f"Size{axis}")) for axis in "ZYX"] == list(GRID.shape)
+
+
+def test_a_range_that_ends_at_minus_0_ends_at_0():
+    assert [f"{value:g}" for value in results.summary(torch.tensor([[[-0.02, -0.0]]])).values()] == [
+        "-0.02",
+        "0",
+        "-0.01",
+    ]
 
 
 def test_the_volume_is_the_specimen_as_far_as_it_can_be_seen(workplace):
@@ -367,7 +376,7 @@ def test_a_pixel_size_that_disagrees_is_warned_of_and_the_configs_wins(other, wo
     assert code == 0
     assert err.count("torchdic: warning: ") == 1
     assert "0.3 × 0.21 µm" in err
-    assert "the config's are used" in err
+    assert "the config's are used; correct volume.spacing or pixel_size if the file is right" in err
     assert read_volume(tmp_path / "out" / "volume.ome.tif")[1] == GRID
 
 
@@ -399,6 +408,45 @@ def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
     after = content(earlier)
     assert set(after) == RESULTS
     assert [name for name in RESULTS - {"log.csv"} if after[name] != before[name]] == []
+
+
+@pytest.mark.parametrize("error", [ValueError("no light"), MemoryError("no room"), FloatingPointError("diverged")])
+def test_a_descent_that_fails_leaves_the_volume_of_its_last_good_step(other, tmp_path, monkeypatch, error):
+    """Where the fit diverges, the last step may be what made it: the one before has a volume that was judged."""
+    original, out = recorded.minimise, tmp_path / "out"
+
+    def minimise(*arguments):
+        for step in original(*arguments):
+            if step.number == 4:
+                raise error
+            yield step
+
+    monkeypatch.setattr(recorded, "minimise", minimise)
+    good = 2 if isinstance(error, FloatingPointError) else 3
+    with pytest.raises(type(error), match=rf"{error}; stopped after step {good} of 8; go on with --resume; volume.ome"):
+        reconstruct.reconstruct(load(other({"reconstruction": {"steps": 8}})), out, torch.device("cpu"))
+    assert set(content(out)) == {"log.csv", "checkpoint.pt", "volume.ome.tif"}
+    assert read_stack(out / "volume.ome.tif").names == (f"delta n, interrupted after step {good}",)
+    monkeypatch.setattr(recorded, "minimise", original)
+    prolonged = load(other({"reconstruction": {"steps": 4}}))
+    result = reconstruct.reconstruct(prolonged, out, torch.device("cpu"), resume=True)
+    assert result.metrics["steps"] == 4
+
+
+def test_a_volume_that_cannot_be_judged_is_left(other, tmp_path, monkeypatch):
+    def no_images(*_):
+        raise ValueError("no light")
+
+    monkeypatch.setattr(results, "model_images", no_images)
+    with pytest.raises(ValueError, match=r"no light; go on with --resume; volume\.ome\.tif holds Δn so far"):
+        reconstruct.reconstruct(load(other({"reconstruction": {"steps": 2}})), tmp_path / "out", torch.device("cpu"))
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.errors.StackWarning")
+def test_a_condenser_open_beyond_the_objective_is_warned_of_by_its_keys_before_the_first_step(other):
+    said = r"microscope\.condenser\.na 1\.2 exceeds microscope\.objective\.na 0\.7: 66% of its light passes beside"
+    with pytest.warns(ApertureWarning, match=said):
+        load_data(load(other({"microscope": {"condenser": {"na": 1.2}}})))
 
 
 # interruptions

@@ -141,12 +141,16 @@ def test_newton_names_what_it_does_not_find(data):
 @pytest.mark.parametrize(
     ("microscope", "acquisition", "law"),
     [
-        (MICROSCOPE, Acquisition([Prism((0.0, 0.24), 0.0), Prism((0.24, 0.0), 2 * math.pi)]), r"\(biases 0, 6.28319\)"),
-        (replace(MICROSCOPE, condenser_prism=False), TRUE, "asks for a condenser prism"),
+        (
+            MICROSCOPE,
+            Acquisition([Prism((0.0, 0.24), 0.0), Prism((0.24, 0.0), 2 * math.pi)]),
+            r"have biases 0, 6\.28319",
+        ),
+        (replace(MICROSCOPE, condenser_prism=False), TRUE, r"a condenser prism, .* is false"),
         (
             replace(MICROSCOPE, polarisation=Polarisation(pupil=JonesPupil(retardance={4: (0.1, 0.0)}))),
             TRUE,
-            "can't hold a polarisation pupil",
+            r"can't hold microscope\.polarisation\.pupil",
         ),
     ],
     ids=["no bias", "no condenser prism", "pupil"],
@@ -155,7 +159,7 @@ def test_newton_names_the_linear_transfer_that_it_lacks(data, microscope, acquis
     data = data[: len(acquisition.prisms), : len(acquisition.focus)]
     setup = Setup(empty_medium(GRID, BACKGROUND, data), microscope, acquisition)
     problem = Problem.from_recipe(data, setup, FIDELITY, Recipe())
-    with pytest.raises(ValueError, match=f"the linear transfer.*{law}.*; use method 'adam'"):
+    with pytest.raises(ValueError, match=f"Newton's method needs .*{law}.*; use method 'adam'"):
         next(minimise(problem))
 
 

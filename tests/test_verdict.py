@@ -8,12 +8,14 @@ import torch
 
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
-from recon.report.causes import seen_in_residual, tried, variants
+from recon.report.causes import Cause, ranked, seen_in_residual, tried, variants
+from recon.report.metrics import coarse_residual
 from recon.report.verdict import LIMIT, PoorFitWarning, Verdict, judged, leaves_too_much
-from recon.run.results import tell
+from recon.run.results import model_images, tell
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 GRID = Grid((6, 24, 22), (0.5, 0.2, 0.2))
@@ -101,6 +103,60 @@ def test_a_variant_differs_from_all_others(data):
 def test_what_newton_cannot_fit_is_not_tried(data):
     assert can_be_tried(problem_of(data))
     assert not can_be_tried(problem_of(data, microscope=Microscope(0.546, condenser_prism=False)))
+
+
+@pytest.mark.parametrize(("name", "rest"), [("sign", "reverse acquisition.focus"), ("focus", "reverse the sign of")])
+def test_the_advice_to_reverse_names_what_else_gives_the_same_images(data, name, rest):
+    """Of shears, planes and Δn's sign all three reversed are a gauge, see tests/test_laws.py."""
+    advice = {v.name: v.advice for v in variants(problem_of(data))}[name]
+    assert f"or, with the same images, {rest}" in advice
+    assert 'set reconstruction.bounds = { lower = "none", upper = 0 } (images' in advice
+    free = {v.name: v.advice for v in variants(problem_of(data, bounds=Bounds(None, None)))}[name]
+    assert f"or, with the same images, {rest}" in free
+    assert "bounds" not in free
+
+
+def test_what_is_assumed_is_advised_first(data):
+    assumed = {v.name: v.advice for v in variants(problem_of(data), ("sign of Δn",))}["focus"]
+    assert assumed.startswith("reverse the sign of every shear and set reconstruction.bounds")
+    assert "or, with the same images, reverse acquisition.focus" in assumed
+    known, near, doubted = Cause("axes", 0.9, "", ""), Cause("focus", 0.85, "", ""), Cause("focus", 0.5, "", "")
+    assert ranked([known, near], ("order of the planes",)) == (near, known)
+    assert ranked([known, near]) == (known, near)
+    assert ranked([known, doubted], ("order of the planes",)) == (known, doubted)
+
+
+@pytest.mark.parametrize("stacked", [True, False])
+def test_a_planes_order_is_advised_only_where_there_are_planes(data, stacked):
+    planes = slice(None) if stacked else slice(1, 2)
+    acquisition = sheared(*SHEARS, focus=FOCUS[planes])
+    advice = {v.name: v.advice for v in variants(problem_of(data[:, planes], acquisition))}["sign"]
+    assert ("focus" in advice) is stacked
+
+
+@pytest.mark.parametrize("name", ["right", "mirrored y", pytest.param("sign", marks=pytest.mark.slow)])
+def test_a_small_noisy_stack_with_a_reversed_axis_is_not_explained(images, name):
+    """A wild volume brings its misfit to the noise's, by following the noise; the right one isn't warned of."""
+    level = 5 * NOISE
+    noisy = images + level * torch.randn(images.shape, generator=torch.Generator().manual_seed(1))
+    setup = Setup(empty_medium(GRID, 1.335, noisy), MICROSCOPE, MISTAKES.get(name, TRUE))
+    problem = Problem.from_recipe(noisy, setup, Fidelity(sources=18), Recipe(), noise=[level] * 2)
+    steps = list(minimise(problem))
+    found = judged(problem, model_images(problem, steps[-1]), [level] * 2, "newton", [step.row for step in steps])
+    assert not leaves_too_much(found.misfit, found.noise)
+    assert found.poor is (name != "right")
+    assert [cause.name for cause in found.causes[:1]] == ([] if name == "right" else [name])
+    assert ("another explains the stack better; most likely" in found.words) is found.poor
+
+
+def test_white_noise_has_a_coarse_residual_of_1_and_structure_more():
+    noise = torch.randn(2, 3, 60, 60, generator=torch.Generator().manual_seed(0))
+    rows, columns = noise * 0.1, torch.sin(torch.arange(60) / 4.0)
+    assert coarse_residual(rows, [0.1, 0.1]) == pytest.approx(1, abs=0.1)  # two of its standard deviations
+    # means over three pixels keep (sin 3w/sin w/3)² = 0.92 of the wave's power 1/2, at w = 1/8
+    expected = 9 * 0.5 * 0.01 * (math.sin(3 / 8) / math.sin(1 / 8) / 3) ** 2 / 0.01
+    assert coarse_residual(0.1 * columns.expand(2, 3, 60, 60), [0.1, 0.1]) == pytest.approx(expected, rel=0.1)
+    assert coarse_residual(rows[..., :2], [0.1, 0.1]) == 1.0
 
 
 # causes that the residual shows
@@ -194,3 +250,22 @@ def test_a_volume_that_follows_the_noise_is_told():
 
 def test_free_bounds_are_told():
     assert "Δn's sign is free" in Verdict(0.13, 0.13, 1.0, free=True).words
+
+
+def test_a_sign_that_is_assumed_is_told_beside_the_volume_that_explains_the_stack():
+    words = Verdict(0.13, 0.13, 1.0, assumed=("bias", "sign of Δn")).words
+    assert words.endswith("; so does −Δn with reversed shears and planes: sign of Δn is assumed")
+    assert "−Δn" not in Verdict(0.13, 0.13, 1.0, assumed=("bias",)).words
+
+
+def test_without_a_cause_what_is_assumed_is_to_be_checked_first():
+    assert "check what is assumed (bias), then pixel size" in Verdict(0.5, 0.13, 1.0, assumed=("bias",)).words
+
+
+def test_a_volume_that_is_full_of_the_other_sign_is_told(images, data, truth):
+    """The ball less its own Δn everywhere gives the same images: a specimen above the medium, bounds below it."""
+    rows = [(n, 0.5, 0.5, 1.0) for n in range(20)]
+    problem = problem_of(data, bounds=Bounds(None, 0.0))
+    found = judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth - truth.max())
+    assert "the volume explains the stack; more than half of the volume has a Δn of about -0.02: images" in found.words
+    assert "more than half" not in judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth).words

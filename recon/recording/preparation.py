@@ -164,7 +164,8 @@ def prepare(
     normalisation = normalisation or Normalisation()
     _check_normalisation(stack, normalisation)
     check_counts(stack, expected)
-    pixel_size = _agreed_pixel_size(stack, expected.pixel_size)
+    key = "volume.spacing or pixel_size" if expected.field is None else "microscope.camera.pixel_size"
+    pixel_size = _agreed_pixel_size(stack, expected.pixel_size, key)
     _compare_focus(stack, expected.focus)
     _check_saturation(stack)
     levels, left_out = expected.empty_levels, left_out or LeftOut()
@@ -314,11 +315,33 @@ def check_counts(stack: Stack, expected: ExpectedStack) -> None:
             height, width = expected.field
             side = expected.pixel_size[0]
             volume = f"the volume of {height:.4g} × {width:.4g} µm in whole pixels of the camera, of {side:.4g} µm,"
-        raise StackError(f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), {volume} {ny} × {nx}")
+        raise StackError(
+            f"{stack.source} has {held[2]} × {held[3]} pixels (y × x), {volume} {ny} × {nx}; {_to_fit(stack, expected)}"
+        )
 
 
-def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tuple[float, float]:
-    """The wanted pixel size (y, x) in µm, or the file's where none is wanted. Warns where the two differ."""
+def _to_fit(stack: Stack, expected: ExpectedStack) -> str:
+    """What to change in a configuration so that its volume has the stack's pixels."""
+    ny, nx = stack.data.shape[2:]
+    if expected.field is None or expected.pixel_size is None:
+        return (
+            f"let volume.shape end in {ny}, {nx}, or, where voxels aren't to be pixels, give "
+            "microscope.camera.pixel_size and a volume as wide as the images"
+        )
+    height, width = expected.field
+    dy, dx = expected.pixel_size
+    wider = f"volume.shape × volume.spacing must be {ny * dy:.4g} × {nx * dx:.4g} µm (y × x)"
+    fitting = height / ny, width / nx
+    if _differ(*fitting):
+        return wider
+    return f"{wider}, or microscope.camera.pixel_size {fitting[0]:.4g} in the specimen"
+
+
+def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None, key: str) -> tuple[float, float]:
+    """The wanted pixel size (y, x) in µm, or the file's where none is wanted. Warns where the two differ.
+
+    key: of a configuration, that says the wanted one.
+    """
     found = stack.pixel_size
     if wanted is None:
         if found is None:
@@ -327,7 +350,7 @@ def _agreed_pixel_size(stack: Stack, wanted: tuple[float, float] | None) -> tupl
     if found is not None and any(_differ(a, b) for a, b in zip(found, wanted, strict=True)):
         warnings.warn(
             f"{stack.source}: its pixels are {found[0]:.4g} × {found[1]:.4g} µm (y × x), the config's "
-            f"{wanted[0]:.4g} × {wanted[1]:.4g} µm; the config's are used",
+            f"{wanted[0]:.4g} × {wanted[1]:.4g} µm; the config's are used; correct {key} if the file is right",
             StackWarning,
             stacklevel=3,
         )

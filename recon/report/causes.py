@@ -44,6 +44,17 @@ PRISM, IMAGE = 3.0, 6.0
 
 PRIORS = "priors"
 
+# Shears, planes and the sign of Δn, all three reversed, give the same images to first order. So what one of these
+# reversals explains is explained as well by the rest of the three: this, and Δn of the other sign.
+REST = {"sign": "reverse acquisition.focus", "focus": "reverse the sign of every shear", "sign and focus": ""}
+
+# The name under which a configuration's `assumed` lists what a cause doubts.
+SIGN, ORDER = "sign of Δn", "order of the planes"
+DOUBTS = {"Δn's sign": SIGN, "focus": ORDER, "sign and focus": ORDER, "condenser": "condenser's NA"}
+
+# A cause that doubts what is assumed comes before another that explains more by at most this share.
+NEAR = 0.1
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -69,9 +80,9 @@ class Variant:
     problem: Problem
 
 
-def ranked(causes: Sequence[Cause]) -> tuple[Cause, ...]:
-    """The likeliest cause first."""
-    return tuple(sorted(causes, key=lambda cause: -cause.share))
+def ranked(causes: Sequence[Cause], assumed: Sequence[str] = ()) -> tuple[Cause, ...]:
+    """The likeliest cause first; of those that explain nearly as much, one that doubts what is assumed."""
+    return tuple(sorted(causes, key=lambda cause: -cause.share - NEAR * (DOUBTS.get(cause.name) in assumed)))
 
 
 # --- what the residual shows ------------------------------------------------------------------------------------------
@@ -95,7 +106,8 @@ def seen_in_residual(
             "brightness",
             min(1.0, level / excess),
             "the residual is uniform within each image",
-            "fit the brightness (method 'newton' or 'adam'), or flatten the stack (data.flatten = true)",
+            "bring the stack to the model's level (data.scale = 'background', data.flatten = true), or correct what "
+            "sets it: the bias of each prism and the apertures (na)",
         )
     if margin == 0:
         yield from _cut(squares.mean((0, 1)), noise)
@@ -164,18 +176,22 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
 # --- what short fits show ---------------------------------------------------------------------------------------------
 
 
-def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
+def tried(
+    problem: Problem, misfit: float, noise: float, assumed: Sequence[str] = (), sure: float = 0.0
+) -> Iterator[Cause]:
     """The causes that explain the stack better in a short fit than what was declared does.
 
-    misfit: of the finished volume. noise: what noise leaves of it. A fit whose light can't be followed explains
-    nothing. Without priors any fit comes closer, so that one must come closer than the finished one.
+    misfit: of the finished volume. noise: what noise leaves of it. assumed: what nobody has said, by the names of a
+    configuration's `assumed`. sure: part of the declared short fit's misfit by which another must be lower. A fit whose
+    light can't be followed explains nothing. Without priors any fit comes closer, so that one must come closer than the
+    finished one.
     """
     declared = short_fit(problem)
-    for variant in variants(problem):
+    for variant in variants(problem, assumed):
         found = short_fit(variant.problem)
         usual = misfit if variant.name == PRIORS else declared
         share = min(1.0, (usual - found) / max(usual - noise, 1e-12))
-        if share < LEAST:
+        if share < LEAST or usual - found < sure * usual:
             continue
         reason = f"a short fit so has a misfit of {found:.3g}, as declared {usual:.3g}"
         yield Cause(variant.name, share, f"{variant.what}: {reason}", variant.advice)
@@ -183,15 +199,17 @@ def tried(problem: Problem, misfit: float, noise: float) -> Iterator[Cause]:
             return
 
 
-def variants(problem: Problem) -> Iterator[Variant]:
-    """The problem with each likely mistake undone, the likeliest first; those that change nothing are left out."""
+def variants(problem: Problem, assumed: Sequence[str] = ()) -> Iterator[Variant]:
+    """The problem with each likely mistake undone, the likeliest first; those that change nothing are left out.
+
+    assumed: as in `tried`.
+    """
     setup = problem.setup
+    bounds = _index(problem).bounds
     lower = _of_the_other_sign(problem)
     if lower is not None:
-        advice = (
-            "let the bounds of Δn hold the other sign; or reverse every shear and acquisition.focus, which to first "
-            "order gives the same images"
-        )
+        ways = (f"set {_written(_mirrored(bounds))}", f"reverse the sign of every shear and {REST['sign']}")
+        advice = _either(*ways, prefer_rest=ORDER in assumed and SIGN not in assumed)
         yield Variant("Δn's sign", "Δn is on the other side of 0", advice, lower)
     seen = [images_of(setup.acquisition)]
     for other in one_mistake(setup.acquisition):
@@ -199,7 +217,11 @@ def variants(problem: Problem) -> Iterator[Variant]:
         if made not in seen:
             seen.append(made)
             changed = replace(problem, setup=replace(setup, acquisition=other.acquisition))
-            yield Variant(other.name, other.what, other.advice, changed)
+            advice = other.advice
+            if other.name in REST:
+                prefer_rest = SIGN in assumed and DOUBTS.get(other.name) not in assumed
+                advice = _either(advice, _rest(other.name, setup, bounds), prefer_rest=prefer_rest)
+            yield Variant(other.name, other.what, advice, changed)
     for na, changed in _apertures(setup):
         advice = f"check the condenser's aperture diaphragm and immersion (na {na:.2g} explains more)"
         yield Variant("condenser", f"the condenser's na is nearer to {na:.2g}", advice, replace(problem, setup=changed))
@@ -208,13 +230,42 @@ def variants(problem: Problem) -> Iterator[Variant]:
         yield Variant(PRIORS, "the priors are too strong", advice, replace(problem, priors=(), weight=None))
 
 
+def _rest(name: str, setup: Setup, bounds: Bounds) -> str:
+    """What beside a reversal that explains a stack gives the same images: the rest of the three, in words."""
+    rest = REST[name] if len(setup.acquisition.focus) > 1 else ""  # one plane has no order
+    other = _mirrored(bounds)
+    sign = "" if other == Bounds(bounds.lower, bounds.upper) else f"set {_written(other)}"
+    return " and ".join(filter(None, (rest, sign))) or "take −Δn for Δn"
+
+
+def _either(way: str, rest: str, *, prefer_rest: bool) -> str:
+    """Two changes that give the same images, in words. prefer_rest: names the second one first."""
+    first, second = (rest, way) if prefer_rest else (way, rest)
+    return f"{first}; or, with the same images, {second} (images can't tell the sign of Δn)"
+
+
+def _mirrored(bounds: Bounds) -> Bounds:
+    """The bounds of −Δn."""
+    return Bounds(*(None if bound is None else -bound + 0.0 for bound in (bounds.upper, bounds.lower)))
+
+
+def _written(bounds: Bounds) -> str:
+    """Bounds as a configuration has them."""
+    lower, upper = ('"none"' if bound is None else f"{bound:g}" for bound in (bounds.lower, bounds.upper))
+    return f"reconstruction.bounds = {{ lower = {lower}, upper = {upper} }}"
+
+
+def _index(problem: Problem) -> IndexDifference:
+    return next(unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference))
+
+
 def _of_the_other_sign(problem: Problem) -> Problem | None:
     """The problem with Δn on the other side of 0; None where its bounds don't end there, or a support has its own."""
-    index = next(unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference))
+    index = _index(problem)
     bounds = index.bounds
     if isinstance(bounds, SupportedBounds) or {bounds.lower, bounds.upper} != {0, None}:
         return None
-    mirrored = Bounds(*(None if bound is None else -bound + 0.0 for bound in (bounds.upper, bounds.lower)))
+    mirrored = _mirrored(bounds)
     changed = [replace(index, bounds=mirrored) if unknown is index else unknown for unknown in problem.unknowns]
     return replace(problem, unknowns=changed)
 

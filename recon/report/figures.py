@@ -11,6 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 from torch import Tensor
 
 from torchdic import Grid, Prism
@@ -57,13 +58,14 @@ def draw_images(
 ) -> Figure:
     """Draw measured and modelled images and their difference: a row for each prism, three focus planes at most.
 
+    A row has one scale of grey for what was measured and modelled, the figure one for all residuals.
     measured, modelled: stacks in units of the empty bright field.
     prisms, focus: the stacks' prism settings (None is bright field) and focus planes in µm.
     grid: the volume's, whose (y, x) spacing is the pixels'.
     """
     planes = sorted({len(focus) // 4, len(focus) // 2, (3 * len(focus)) // 4})
     aspect = grid.extent[1] / grid.extent[2]
-    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
+    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1.8, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
     axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
     residual = measured - modelled
     _, largest = _limits(residual[:, planes].abs())
@@ -82,7 +84,10 @@ def draw_images(
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
             scale_bar(trio[0], grid.extent[2], "white")
         axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
-        figure.colorbar(axes[p, -1].images[0], ax=axes[p, -1], label="residual")
+        for ax, words in ((axes[p, -2], "intensity"), (axes[p, -1], "residual")):
+            bar = figure.colorbar(ax.images[0], ax=ax, pad=0.02, aspect=15)
+            bar.set_label(words, fontsize=8)
+            bar.ax.tick_params(labelsize=7)
     return figure
 
 
@@ -101,7 +106,7 @@ def draw_sections(
     planes: Sequence[str] = ("xy", "xz", "yz"),
     through: tuple[int, int, int] | None = None,
 ) -> Figure:
-    """Draw sections through volumes on one scale: a column for each volume, a row for each plane.
+    """Draw sections through volumes on one scale: a column for each volume, a row for each plane, its place above it.
 
     volumes: Δn (z, y, x) by title.
     grid: of all volumes.
@@ -115,7 +120,7 @@ def draw_sections(
     heights = [size[name[1]] for name in planes]
     widest = max(size[name[0]] for name in planes)
     figure = Figure(
-        figsize=(2.4 * len(volumes) + 1.2, 2.4 * sum(heights) / widest + 0.35 * len(planes) + 0.2),
+        figsize=(2.4 * len(volumes) + 1.2, 2.4 * sum(heights) / widest + 0.42 * len(planes) + 0.2),
         layout="constrained",
     )
     axes = figure.subplots(len(planes), len(volumes), squeeze=False, height_ratios=heights)
@@ -127,6 +132,7 @@ def draw_sections(
             shown = _show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
             ax.set_ylabel(name[1], fontsize=8, labelpad=1)
+            ax.set_title(_place(grid, name, through), fontsize=7, loc="right", pad=2)
             scale_bar(ax, size[name[0]], "white")
         column[0].set_title(title, fontsize=9)
     assert shown is not None
@@ -202,7 +208,11 @@ def scale_bar(ax: Axes, width: float, colour: str) -> None:
     length = max(m * power for m in (1, 2, 5) if m * power <= width / 4)
     bottom, top = ax.get_ylim()
     height = abs(bottom - top)
-    ax.add_patch(Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0))
+    # to be seen on any colour
+    around: list[AbstractPathEffect] = [withStroke(linewidth=1, foreground="black" if colour == "white" else "white")]
+    bar = Rectangle((0.05 * width, bottom - 0.07 * height), length, 0.02 * height, color=colour, linewidth=0)
+    bar.set_path_effects(around)
+    ax.add_patch(bar)
     ax.text(
         0.05 * width,
         bottom - 0.09 * height,
@@ -211,7 +221,15 @@ def scale_bar(ax: Axes, width: float, colour: str) -> None:
         fontsize=7,
         ha="left",
         va="bottom",
+        path_effects=around,
     )
+
+
+def _place(grid: Grid, plane: str, through: tuple[int, int, int]) -> str:
+    """Where a section lies along the axis across it, in µm from the volume's centre. plane: such as "xy"."""
+    axis = next(i for i, letter in enumerate("zyx") if letter not in plane)
+    place = (through[axis] - (grid.shape[axis] - 1) / 2) * grid.spacing[axis]
+    return f"{'zyx'[axis]} = {place:.3g} µm".replace("-", "−")
 
 
 def _centre(volume: Tensor) -> tuple[int, int, int]:

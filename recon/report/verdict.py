@@ -20,17 +20,29 @@ from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Row
 from recon.fit.unknowns import IndexDifference
 from recon.prior.weight import FALLING, whiteness
-from recon.report.causes import Cause, ranked, seen_in_residual, tried
+from recon.report.causes import DOUBTS, ORDER, PRIORS, SIGN, Cause, ranked, seen_in_residual, tried
+from recon.report.metrics import COARSE, coarse_residual
 
 # Misfit over noise's above which a volume doesn't explain its stack, if LEAST of the specimen's contrast is unexplained
 # as well: without noise, voxels and directions leave some 0.05 %. Right fits of the benchmarks end at 0.99 to 1.05.
 LIMIT, LEAST = 1.1, 0.02
+
+# Where the median of Δn is more than this part of the largest |Δn|, most of the volume isn't the medium. The priors
+# leave it at 0 in a medium with specimens.
+FILLED = 0.25
 
 # Below it the volume has followed the noise.
 FOLLOWS = 0.9
 
 # A residual whose high frequencies are by more than this part weaker or stronger than all has structure.
 WHITE = 0.1
+
+# A volume of a wrong geometry may follow so much of the noise that its misfit is the noise's. Structure is left then:
+# where the residual's means over a few pixels have more than STRUCTURE times the power that noise leaves of them, and
+# LEAST of the contrast more, other descriptions are tried. One whose short fit leaves SURE less is told.
+# Right fits of small noisy scenes have 0.99 to 1.1, wrong ones 1.5 to 2.4; short fits of the right ones leave a seventh
+# to a third less.
+STRUCTURE, SURE = 1.3, 0.08
 
 # A descent of fewer steps hasn't come far enough for its misfit to tell anything but that.
 FEW_STEPS = 8
@@ -49,7 +61,8 @@ class Verdict:
     misfit, noise: of the volume, and what noise leaves; None where that isn't known. white: see
     `recon.prior.weight.whiteness`; 1 is white. causes: what may be wrong, the likeliest first; empty where the volume
     explains the stack. free: whether the bounds leave the sign of Δn free. expected: whether the method's images are
-    expected to come down to the noise.
+    expected to come down to the noise. assumed: what nobody has said, by the names of a configuration's `assumed`.
+    filled: the median of Δn where most of the volume isn't the medium; else None.
     """
 
     misfit: float
@@ -58,6 +71,8 @@ class Verdict:
     causes: tuple[Cause, ...] = ()
     free: bool = False
     expected: bool = True
+    assumed: tuple[str, ...] = ()
+    filled: float | None = None
 
     @property
     def ratio(self) -> float | None:
@@ -71,8 +86,11 @@ class Verdict:
 
     @property
     def poor(self) -> bool:
-        """Whether the volume leaves more than noise and the model do, or more than an empty medium."""
-        return leaves_too_much(self.misfit, self.noise)
+        """Whether the volume leaves more than noise and the model do, or than an empty medium, or follows the noise.
+
+        The last is so where another description of the stack explains it far better.
+        """
+        return leaves_too_much(self.misfit, self.noise) or bool(self.causes)
 
     @property
     def alarming(self) -> bool:
@@ -104,24 +122,47 @@ class Verdict:
             return f"{empty}; {self._likeliest()}" if self.causes else empty
         if self.poor and not self.expected:
             return "a method without a descent leaves that much even where all is right; 'newton' explains more"
+        if self.poor and not leaves_too_much(self.misfit, self.noise):
+            return f"the volume follows the noise, and another explains the stack better; {self._likeliest()}"
         if self.poor:
             return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
-        free = "; Δn's sign is free: reversed shears and planes give the same images with −Δn" if self.free else ""
+        free = self._gauge() + self._offset()
         if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
             return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
         if self.noise is None:
             return f"it explains {self.explained:.1%} of the contrast, residual {residual}{free}"
         return f"the volume explains the stack{free}"
 
+    def _gauge(self) -> str:
+        """What explains the stack as well, where nobody has said that it isn't so."""
+        if self.free:
+            return "; Δn's sign is free: reversed shears and planes give the same images with −Δn"
+        doubted = [name for name in (SIGN, ORDER) if name in self.assumed]
+        if not doubted:
+            return ""
+        are = "are" if len(doubted) > 1 else "is"
+        return f"; so does −Δn with reversed shears and planes: {' and '.join(doubted)} {are} assumed"
+
+    def _offset(self) -> str:
+        """What a constant Δn may hide, where there is one."""
+        if self.filled is None:
+            return ""
+        return (
+            f"; more than half of the volume has a Δn of about {self.filled:.2g}: images don't tell a constant one, so "
+            "if that is the medium, Δn has the other sign (reconstruction.bounds)"
+        )
+
     def _likeliest(self) -> str:
         if not self.causes:
+            checked = ", ".join(self.assumed)
             return (
-                "no single cause was found: check pixel size, focus step, wavelength, apertures, shear and bias, "
-                "and try learn = ['bias', 'drift']"
+                f"no single cause was found: check {f'what is assumed ({checked}), then ' if checked else ''}"
+                "pixel size, focus step, wavelength, apertures, shear and bias, and try learn = ['bias', 'drift']"
             )
         first, *others = self.causes
         named = f"; or {', '.join(dict.fromkeys(cause.name for cause in others[:2]))}" if others else ""
-        return f"most likely: {first.name} ({first.reason}): {first.advice}{named}"
+        assumed = "; it is assumed" if DOUBTS.get(first.name) in self.assumed else ""
+        return f"most likely: {first.name} ({first.reason}{assumed}): {first.advice}{named}"
 
     def as_json(self) -> dict[str, Any]:
         """The verdict as metrics.json holds it."""
@@ -155,21 +196,44 @@ def judged(
     noise: Sequence[float] | None,
     method: str,
     rows: Sequence[Row],
+    assumed: Sequence[str] = (),
+    delta: Float[Tensor, "z y x"] | None = None,
 ) -> Verdict:
     """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
 
     images: the model's, of the last step. noise: standard deviation of each prism's, None where it isn't known.
-    method: that found the volume. rows: of the log.
+    method: that found the volume. rows: of the log. assumed: what nobody has said, by the names of a configuration's
+    `assumed`. delta: the volume's; None doesn't look at it.
     """
     misfit = float(problem.misfit(images))
     alone = problem.misfit.of_noise(noise) if noise is not None or problem.misfit.knows_all else None
     index = next((unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference)), None)
     free = index is not None and _free(index.bounds)
     white = whiteness(images, problem.misfit)
-    found = Verdict(misfit, alone, white, free=free, expected=method not in DIRECT)
-    if not found.poor or not found.expected:
+    filled = None if delta is None else _filling(delta)
+    found = Verdict(misfit, alone, white, (), free, method not in DIRECT, tuple(assumed), filled)
+    if not found.expected:
         return found
-    return replace(found, causes=_causes(problem, images, found, rows))
+    if found.poor:
+        return replace(found, causes=_causes(problem, images, found, rows))
+    structured = noise is not None and _structured(problem, images, noise)
+    if structured and (len(rows) >= FEW_STEPS or not rows) and can_be_tried(problem):
+        print("the residual has structure: short fits of what may have been declared wrongly …")
+        # a volume without priors follows the noise more closely in any case
+        causes = [cause for cause in _tried(problem, found, SURE) if cause.name != PRIORS]
+        return replace(found, causes=ranked(causes, found.assumed))
+    return found
+
+
+def _structured(problem: Problem, images: Tensor, noise: Sequence[float]) -> bool:
+    """Whether the residual's means over a few pixels hold far more than noise leaves, and enough of the contrast.
+
+    noise: standard deviation of each prism's.
+    """
+    misfit = problem.misfit
+    power = coarse_residual(misfit.where_counted(images - misfit.data), noise)
+    share = float((images.new_tensor(list(noise)).square() / misfit.variance.flatten()).mean())
+    return power > STRUCTURE and (power - 1) / COARSE**2 * share > LEAST * max(1 - share, 0.0)
 
 
 def _causes(problem: Problem, images: Tensor, found: Verdict, rows: Sequence[Row]) -> tuple[Cause, ...]:
@@ -180,13 +244,20 @@ def _causes(problem: Problem, images: Tensor, found: Verdict, rows: Sequence[Row
         causes += seen_in_residual(images, problem.misfit, noise, problem.setup.margin)
         if can_be_tried(problem):
             print("the misfit is far above the noise's: short fits of what may have been declared wrongly …")
-            try:
-                with torch.enable_grad():
-                    for cause in tried(problem, found.misfit, noise):
-                        causes.append(cause)
-            except KeyboardInterrupt:  # the volume is found and is still to be written
-                print("the search for causes was interrupted")
-    return ranked(causes)
+            causes += _tried(problem, found)
+    return ranked(causes, found.assumed)
+
+
+def _tried(problem: Problem, found: Verdict, sure: float = 0.0) -> list[Cause]:
+    """The causes that short fits find; those so far where Ctrl-C ends the search. sure: as in `tried`."""
+    causes: list[Cause] = []
+    try:
+        with torch.enable_grad():
+            for cause in tried(problem, found.misfit, found.noise or 0.0, found.assumed, sure):
+                causes.append(cause)
+    except KeyboardInterrupt:  # the volume is found and is still to be written
+        print("the search for causes was interrupted")
+    return causes
 
 
 def _unfinished(rows: Sequence[Row]) -> list[Cause]:
@@ -199,6 +270,12 @@ def _unfinished(rows: Sequence[Row]) -> list[Cause]:
             reason = f"the last step lowered the misfit by {1 - last / before:.0%}"
             return [Cause(FEW, 0.3, reason, "let it take more: reconstruction.steps")]
     return []
+
+
+def _filling(delta: Float[Tensor, "z y x"]) -> float | None:
+    """The median of Δn where most of the volume isn't the medium; else None."""
+    median = float(delta.median())
+    return median if abs(median) > FILLED * float(delta.abs().max()) else None
 
 
 def _free(bounds: Bounds) -> bool:

@@ -1,5 +1,6 @@
 """The measured stack that a configuration names, in the model's unit."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from torch import Tensor
 
 from recon.config.schema import Config, ConfigError, DataSection
-from recon.fit.newton.weak_hessian import responds_linearly
+from recon.fit.newton.weak_hessian import lacks_of_linear_response
 from recon.fit.problem import DIRECT
 from recon.fit.setup import on_voxels, pixels_of
 from recon.misfit.base import spatial_variance
@@ -16,7 +17,7 @@ from recon.recording.masks import LeftOut, counted_pixels, left_out
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from recon.recording.support import edges_support
-from torchdic import Acquisition, Fidelity, Grid, Volume, image
+from torchdic import Acquisition, ApertureWarning, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
 from torchdic.files.joined import read_joined
@@ -36,6 +37,7 @@ def load_data(config: Config) -> Measured:
     if section is None or not section.files:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     check_feasible(config)
+    _warn_of_dark_field(config)
     return prepared(config, read_joined(section.files, section.channels, section.series))
 
 
@@ -50,7 +52,7 @@ def prepared(config: Config, stack: Stack) -> Measured:
         focus=tuple(float(focus) for focus in config.acquisition.focus),
         pixel_size=pixels.spacing[1:],
         pixels=pixels.shape[1:],
-        field=config.volume.grid.extent[1:] if pixels is not config.volume.grid else None,
+        field=config.volume.grid.extent[1:] if pixels != config.volume.grid else None,
         empty=tuple(_empty_field(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
@@ -131,20 +133,33 @@ def check_feasible(config: Config) -> None:
         )
     if method == "opl" and config.reconstruction.support is not None:
         raise ConfigError("reconstruction.support: a path length by section has none; use method 'newton' or 'adam'")
-    section, sheared = config.reconstruction, [prism for prism in config.acquisition.prisms if prism is not None]
-    if section.method in ("newton", "linear"):
-        asks, instead = f"reconstruction.method: {section.method!r} needs", "use method 'adam' with start 'zero'"
-    elif section.method == "adam" and section.start == "linear":
+    if method in ("newton", "linear"):
+        asks, instead = f"reconstruction.method: {method!r} needs", "use method 'adam' with start 'zero'"
+    elif method == "adam" and config.reconstruction.start == "linear":
         asks, instead = "reconstruction.start: 'linear' needs", "use 'zero'"
     else:
         return
-    if sheared and not config.microscope.condenser_prism:
-        raise ConfigError(f"{asks} a condenser prism, microscope.condenser_prism is false; {instead}")
-    if config.microscope.lenses is not None:
-        raise ConfigError(f"{asks} a linear transfer, which can't hold microscope.polarisation.pupil; {instead}")
-    if section.method != "adam" and not responds_linearly(config.microscope, config.acquisition):
-        biases = ", ".join(f"{float(prism.bias):g}" for prism in sheared)
-        raise ConfigError(f"{asks} a linear response, acquisition.prisms have biases {biases}: {instead}")
+    lacking = lacks_of_linear_response(config.microscope, config.acquisition, dark=method == "adam")
+    if lacking is not None:
+        raise ConfigError(f"{asks} {lacking}; {instead}")
+
+
+def _warn_of_dark_field(config: Config) -> None:
+    """Warn ApertureWarning of a condenser that is open beyond the objective, as no DIC condenser is."""
+    objective, condenser = config.microscope.objective, config.microscope.condenser
+    if objective is None or condenser is None or condenser.points is not None:
+        return
+    reach, open_to = (part.na for part in (objective, condenser.limited(config.volume.background)))
+    if open_to > reach:
+        inner = (condenser.inner_na or 0.0) ** 2
+        passing = max(reach**2 - inner, 0.0) / max(open_to**2 - inner, 1e-12)
+        warnings.warn(
+            f"microscope.condenser.na {condenser.na:g} exceeds microscope.objective.na {objective.na:g}: "
+            f"{1 - passing:.0%} of its light passes beside the objective, and the fit may fail; for DIC the condenser "
+            "is opened to some 0.6 to 1 times the objective's NA",
+            ApertureWarning,
+            stacklevel=3,
+        )
 
 
 def _empty_field(config: Config) -> list[float]:

@@ -23,7 +23,7 @@ from recon.run.data import load_data, load_support
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
-from recon.run.recorded import CHECKPOINT, descend_recorded
+from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped
 from recon.run.results import INTERRUPTED, METRICS, Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
@@ -81,6 +81,9 @@ def reconstruct(
         return write_results(out, config, measured, problem, ended, sections)
     except ResultsError as error:
         raise ResultsError(f"{error}{'; make room and go on with --resume' if kept else ''}") from error
+    except STOPPING as error:  # the images by which the volume is judged have no room, or can't be followed
+        error.args = (f"{error}; {leave_stopped(out, problem, ended)}",)
+        raise
 
 
 def spelled_out(config: Config) -> Config:

@@ -18,6 +18,9 @@ from torchdic.files.whole import WriteError
 
 LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 
+# What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's own error).
+STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
+
 
 def descend_recorded(
     problem: Problem, out: Path, checkpoint_every: int, identity: str, start: Checkpoint | None = None
@@ -26,10 +29,12 @@ def descend_recorded(
 
     out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
     depends on, for the checkpoint. start: to go on from.
-    Raises InterruptedRunError on Ctrl-C or SIGTERM, with a checkpoint and the volume of the last step saved;
-    FloatingPointError where the fit diverges. Warns UnsavedWarning where the log or a checkpoint cannot be written.
+    Raises InterruptedRunError on Ctrl-C or SIGTERM, and what a step raises, FloatingPointError where the fit diverges;
+    with a checkpoint and the volume of the last good step saved. Warns UnsavedWarning where the log or a checkpoint
+    cannot be written.
     """
     step: Step | None = None if start is None else start.step
+    good = None  # the step before: its volume has been judged, by the next one
     rows = [] if start is None else start.rows
     announced = 0 if step is None else len(step.plans)
     steps, before = minimise(problem, step), 0.0 if step is None else step.seconds
@@ -39,7 +44,8 @@ def descend_recorded(
         signals_kept() as check_signals,
     ):
         try:
-            for step in steps:
+            for latest in steps:
+                good, step = step, latest
                 log.add(step.row)
                 for record in step.plans[announced:]:
                     tqdm.write(announce_record(record))
@@ -53,21 +59,29 @@ def descend_recorded(
             if step is None:
                 raise InterruptedRunError("interrupted before the first step") from None
             log.add(step.row)  # the signal may have come between the step and its row
-            raise InterruptedRunError(_left(out, problem, Checkpoint(step, log.rows, identity))) from None
+            stopped = Checkpoint(step, log.rows, identity)
+            line = f"interrupted after step {step.number} of {problem.steps}"
+            raise InterruptedRunError(f"{line}; {leave_stopped(out, problem, stopped)}") from None
+        except STOPPING as error:
+            kept = good if isinstance(error, FloatingPointError) else step
+            if kept is None:
+                raise
+            stopped = Checkpoint(kept, [row for row in log.rows if row[0] <= kept.number], identity)
+            line = f"stopped after step {kept.number} of {problem.steps}; {leave_stopped(out, problem, stopped)}"
+            error.args = (f"{error}; {line}",)
+            raise
         assert step is not None
         return Checkpoint(step, log.rows, identity)
 
 
-def _left(out: Path, problem: Problem, stopped: Checkpoint) -> str:
-    """Leave a checkpoint and the volume of an interrupted descent; returns a line about it for the user."""
-    line = f"interrupted after step {stopped.step.number} of {problem.steps}"
+def leave_stopped(out: Path, problem: Problem, stopped: Checkpoint) -> str:
+    """Leave a checkpoint and the volume of a descent that came to no end; returns a line about them for the user."""
     try:
         save(out / CHECKPOINT, stopped)
-        line += "; go on with --resume"
+        line = "go on with --resume"
     except WriteError as error:
-        line += f"; {error}"
+        line = str(error)
     try:
-        line += f"; {leave_interrupted(out, problem, stopped.step).name} holds Δn so far"
+        return f"{line}; {leave_interrupted(out, problem, stopped.step).name} holds Δn so far"
     except StackError as error:
-        line += f"; {error}"
-    return line
+        return f"{line}; {error}"

@@ -75,7 +75,7 @@ def metrics(
         "residual_rms": residual_rms(images, problem.misfit.data, problem.misfit.mask),
         "steps": last.number,
         "seconds": round(last.seconds, 3),
-        "delta": {"min": float(delta.min()), "max": float(delta.max()), "mean": float(delta.mean())},
+        "delta": summary(delta),
         "learned": {name: value.tolist() for name, value in last.values.items() if name != IndexDifference.name},
         "prisms": [asdict(report) for report in measured.prisms],
         "left_out": {"stuck": out.stuck, "saturated": out.saturated, "masked": out.masked, "share": out.share},
@@ -90,6 +90,11 @@ def metrics(
     if last.plans:
         found["plans"] = list(last.plans)
     return found
+
+
+def summary(delta: Float[Tensor, "z y x"]) -> dict[str, float]:
+    """The range and the mean of Δn; a −0 is 0."""
+    return {name: float(of(delta)) + 0.0 for name, of in (("min", torch.min), ("max", torch.max), ("mean", torch.mean))}
 
 
 def _known(value: Any) -> Any:
@@ -122,7 +127,8 @@ def write_results(
     images, data = model_images(problem, last), problem.misfit.data.cpu()
     delta = problem.setup.within_field(last.delta).cpu()
     found = metrics(problem, last, images, measured, config.reconstruction.method)
-    verdict = judged(problem, images, measured.noise, config.reconstruction.method, ended.rows)
+    method = config.reconstruction.method
+    verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, delta)
     found["verdict"] = verdict.as_json()
     tell(verdict)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]

@@ -1,19 +1,25 @@
 """A stack that lies in several files: a folder of planes, a file for each plane, or a file for each prism setting."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from torchdic.errors import StackError
+from torchdic.errors import StackError, StackWarning
 from torchdic.files.described.setup import StatedSetup, setup_in_words, setup_of_all
-from torchdic.files.format import Stack, shape_text
+from torchdic.files.format import Stack
+from torchdic.files.joined import check_alike
 from torchdic.files.stack import FORMATS, format_of, read_stack
 
 # Micro-Manager's file beside the planes of a folder.
 _METADATA = "metadata.txt"
+
+# What a file's name is made of: numbers and words.
+_PART = r"\d+|[^\W\d_]+"
 
 # Letters before a number in a file's name, by which it counts planes or prism settings.
 _OF_PLANES = ("z", "plane", "planes", "slice", "focus", "depth", "t", "time")
@@ -57,7 +63,7 @@ def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
     if len(stacks) == 1:
         return Gathered(_with_sizes(stacks[0], said), files, said)
     source = f"{len(files)} files in {folder or files[0].parent}"
-    _check_alike(files, stacks)
+    check_alike(stacks, settings=True)
     if stacks[0].data.shape[:2] == (1, 1):
         prisms, planes = _layout(files)
         order = np.array(sorted(range(len(files)), key=lambda i: (prisms[i], planes[i])))
@@ -87,7 +93,13 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     found = [file for file in folders[0].iterdir() if file.name.lower().endswith(suffixes) and file.is_file()]
     found = [file for file in found if not file.name.startswith(".")]
     if not found:
-        raise StackError(f"{folders[0]}: holds no images ({', '.join(suffixes)})")
+        others = sorted(file for file in folders[0].iterdir() if not file.name.startswith("."))
+        for file in others:
+            if file.suffix.lower() in (".jpg", ".jpeg"):
+                read_stack(file)  # says why it is no stack
+        more = " and others" if len(others) > 1 else ""
+        holds = f"holds {others[0].name}{more}, but no images" if others else "is empty"
+        raise StackError(f"{folders[0]}: {holds}; a folder of planes has files that end in {', '.join(suffixes)}")
     return tuple(sorted(found, key=lambda path: natural(path.name))), folders[0]
 
 
@@ -110,19 +122,9 @@ def _with_sizes(stack: Stack, said: StatedSetup) -> Stack:
     )
 
 
-def _check_alike(files: Sequence[Path], stacks: Sequence[Stack]) -> None:
-    for file, stack in zip(files, stacks, strict=True):
-        first = stacks[0].data
-        if stack.data.shape != first.shape or stack.data.dtype != first.dtype:
-            raise StackError(
-                f"{file}: holds {shape_text(stack.data.shape)} {stack.data.dtype}, {files[0].name} "
-                f"{shape_text(first.shape)} {first.dtype}; the files of a stack are alike"
-            )
-
-
 def _layout(files: Sequence[Path]) -> tuple[list[int], list[int]]:
     """Which prism setting and which plane each file is, by what changes in their names."""
-    parts = [re.findall(r"\d+|[^\W\d_]+", file.stem) for file in files]
+    parts = [_parts(file) for file in files]
     if len({tuple(part.isdigit() for part in name) for name in parts}) > 1:
         raise StackError(f"{files[0].parent}: the names differ in more than numbers and words: {_two(files)}")
     changing = [i for i in range(len(parts[0])) if len({name[i] for name in parts}) > 1]
@@ -141,11 +143,66 @@ def _layout(files: Sequence[Path]) -> tuple[list[int], list[int]]:
         [natural(name[i[0]]) if i else [] for name in parts] for i in ([] if prism is None else [prism], planes)
     )
     settings, depths = sorted(map(tuple, {tuple(v) for v in of_prisms})), sorted({tuple(v) for v in of_planes})
+    places = [(settings.index(tuple(v)), depths.index(tuple(d))) for v, d in zip(of_prisms, of_planes, strict=True)]
     if len(settings) * len(depths) != len(files):
         raise StackError(
-            f"{files[0].parent}: {len(files)} files are not {len(settings)} settings × {len(depths)} planes"
+            f"{files[0].parent}: {len(files)} files are not {len(settings)} settings × {len(depths)} planes: "
+            f"{_lacking(files, places, prism)}"
         )
-    return [settings.index(tuple(v)) for v in of_prisms], [depths.index(tuple(v)) for v in of_planes]
+    if planes:
+        _warn_of_a_gap(files, planes[0])
+    return [setting for setting, _ in places], [depth for _, depth in places]
+
+
+def _lacking(files: Sequence[Path], places: Sequence[tuple[int, int]], prism: int | None) -> str:
+    """The names of the files that a rectangle of settings and planes lacks, or of two files at one place of it.
+
+    places: (setting, plane) of each file. prism: which part of the names tells the settings; None is none, of one.
+    """
+    at: dict[tuple[int, int], Path] = {}
+    for file, place in zip(files, places, strict=True):
+        if place in at:
+            return f"{at[place].name} and {file.name} are of one setting and plane"
+        at[place] = file
+    settings, depths = ({place[i]: file for place, file in at.items()} for i in (0, 1))
+    names = [
+        _renamed(depths[depth], prism, _parts(settings[setting])[prism])
+        for setting in sorted(settings)
+        for depth in sorted(depths)
+        if prism is not None and (setting, depth) not in at
+    ]
+    many = " and others" if len(names) > 3 else ""
+    return f"{', '.join(names[:3])}{many} {'is' if len(names) == 1 else 'are'} missing"
+
+
+def _warn_of_a_gap(files: Sequence[Path], index: int) -> None:
+    """Warn StackWarning where the numbers that count planes leave one out. index: of the part of the names."""
+    numbered = {int(part): file for file in files if (part := _parts(file)[index]).isdigit()}
+    numbers = sorted(numbered)
+    steps = [b - a for a, b in pairwise(numbers)]
+    wide = next((i for i, step in enumerate(steps) if step > min(steps)), None)
+    if wide is None:
+        return
+    before, after = numbered[numbers[wide]], numbered[numbers[wide + 1]]
+    lacking = numbers[wide] + min(steps)
+    name = _renamed(before, index, str(lacking).zfill(len(_parts(before)[index])))
+    warnings.warn(
+        f"{files[0].parent}: {name} is missing between {before.name} and {after.name}; the planes are taken as equally "
+        "spaced without it",
+        StackWarning,
+        stacklevel=4,
+    )
+
+
+def _parts(file: Path) -> list[str]:
+    """The numbers and the words of a file's name."""
+    return re.findall(_PART, file.stem)
+
+
+def _renamed(file: Path, index: int, part: str) -> str:
+    """The name of a file with another part in a place."""
+    place = list(re.finditer(_PART, file.stem))[index]
+    return f"{file.stem[: place.start()]}{part}{file.stem[place.end() :]}{file.suffix}"
 
 
 def _counts(name: Sequence[str], index: int, words: Sequence[str]) -> bool:

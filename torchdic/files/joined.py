@@ -38,7 +38,7 @@ def read_joined(paths: Sequence[str], channels: Sequence[int] | None = None, ser
             found = "one channel" if held == 1 else f"{held} channels"
             raise StackError(f"{path}: has {found}, counted from 0; there is no channel {channel}")
     stacks = list(files.values())
-    _check_alike(stacks)
+    check_alike(stacks)
     first = stacks[0]
     if len(stacks) == 1 and chosen == [(paths[0], channel) for channel in range(len(first.data))]:
         return first
@@ -54,12 +54,12 @@ def read_joined(paths: Sequence[str], channels: Sequence[int] | None = None, ser
     )
 
 
-def _check_alike(stacks: Sequence[Stack]) -> None:
-    """Raise StackError where files can't be parts of one stack."""
-    first = stacks[0]
+def check_alike(stacks: Sequence[Stack], *, settings: bool = False) -> None:
+    """Raise StackError where files can't be parts of one stack. settings: whether each must hold as many of them."""
+    first, shape = stacks[0], "settings × planes × pixels (y × x)" if settings else "planes × pixels (y × x)"
     for other in stacks[1:]:
         for what, of in (
-            ("planes × pixels (y × x)", lambda stack: shape_text(stack.data.shape[1:])),
+            (shape, lambda stack: shape_text(stack.data.shape[0 if settings else 1 :])),
             ("pixels of type", lambda stack: stack.data.dtype.name),
             ("full scale", lambda stack: stack.full_scale),
         ):

@@ -5,7 +5,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from torchdic.errors import StackError
+from torchdic.files.arrangement.grey import coloured
 from torchdic.files.format import Format, Stack
 
 
@@ -15,7 +15,7 @@ def _read(path: Path) -> Stack:
     if image.ndim == 3:
         colours = image[..., : 1 if image.shape[2] == 2 else 3]  # two samples are grey and its transparency
         if (colours != colours[..., :1]).any():
-            raise StackError(f"{path}: is a colour image, {image.shape[2]} samples per pixel; a stack is grey")
+            raise coloured(path, image.shape[2])
         image = np.ascontiguousarray(colours[..., 0])
     return Stack(image[None, None], source=str(path))
 

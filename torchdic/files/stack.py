@@ -27,6 +27,9 @@ from torchdic.grid import Grid
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
 FORMATS: list[Format] = [TIFF, PNG, ND2, CZI]
 
+# The first bytes of a JPEG, whatever its name. Reading one would take its blocks for specimen.
+_JPEG = b"\xff\xd8\xff"
+
 
 def format_of(path: str | os.PathLike[str]) -> Format:
     """The format of a file, by the suffix of its name; TIFF for a suffix that no format has."""
@@ -179,15 +182,20 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
 def _check_openable(path: Path) -> None:
     try:
         with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
+            size, head = os.fstat(file.fileno()).st_size, file.read(len(_JPEG))
     except FileNotFoundError as error:
         raise StackError(f"{path}: no such file") from error
     except IsADirectoryError as error:
-        raise StackError(f"{path}: is a folder; a stack is one file") from error
+        raise StackError(f"{path}: is a folder; a stack is one file, which torchdic new makes of a folder") from error
     except OSError as error:
         raise StackError(f"{path}: cannot be opened: {error.strerror or error}") from error
     if size == 0:
         raise StackError(f"{path}: is empty, 0 bytes")
+    if head == _JPEG:
+        raise StackError(
+            f"{path}: is a JPEG, whose compression has changed its greys; export the recording again as TIFF, which "
+            "keeps them: from the microscope's program, or open its own file in Fiji, File > Save As > Tiff…"
+        )
 
 
 def _check_writable(path: Path, stack: Stack, dtypes: tuple[str, ...]) -> None:

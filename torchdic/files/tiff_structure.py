@@ -29,7 +29,10 @@ def check_pages(path: Path) -> None:
     with path.open("rb") as file:
         head = file.read(4)
         if head not in _MAGIC:
-            raise StackError(f"{path}: is no TIFF: it starts with {head!r}, a TIFF with II or MM and 42 or 43")
+            raise StackError(
+                f"{path}: is no TIFF: it starts with {head!r}, a TIFF with II or MM and 42 or 43; Fiji saves "
+                "as one what it can open: File > Save As > Tiff…"
+            )
         order, is_big = _MAGIC[head]
         tiff = _OpenTiff(file, path, os.fstat(file.fileno()).st_size, order, is_big)
         page = tiff.number(8 if is_big else 4, tiff.pointer)

@@ -122,7 +122,7 @@ def _check_energy(S: Tensor, pz: Tensor, volume: Volume, momentum: Tensor, steps
     lossless = volume.absorption is None
     if most <= MOST_ENERGY and (least >= LEAST_ENERGY or not lossless):
         return
-    low, high = (float(v) for v in torch.aminmax(volume.delta))
+    low, high = (float(v) + 0.0 for v in torch.aminmax(volume.delta))  # −0 is 0
     lowest, oblique = number(volume.background) + low, float(momentum.norm(dim=-1).max())
     thickness = volume.grid.extent[0] / steps
     if not math.isfinite(most) and lowest <= oblique:

@@ -191,7 +191,10 @@ class _Descent:
             place = self.weighted(place, now, number)
             misfit, loss = now.misfit, now.misfit + self.penalty(place, place.delta, number)
             check_convergence(number + 1, loss, self.values(place), self.lowest(place.delta))
-            place, now = self.advanced(place, now, hessian, (draft, exact), number)
+            try:
+                place, now = self.advanced(place, now, hessian, (draft, exact), number)
+            except NO_IMAGES:  # of the drafts' directions, or of the careful ones
+                place = self.taken_back(place)
             taken, values = seconds + time.perf_counter() - started, self.values(place)
             yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
 
@@ -410,11 +413,8 @@ class _Descent:
         return (*place.pairs, (step, self.voxels * (there.gradient - now.gradient)))[-MEMORY:]
 
     def tried(self, place: Place, draft: Fidelity) -> Formed | None:
-        """The images of a trial, with the nuisances and the correction as they are; None where it has none."""
-        try:
-            formed = self.formed(place, draft)
-        except NO_IMAGES:
-            return None
+        """The images of a trial, with the nuisances and the correction as they are; None where they aren't finite."""
+        formed = self.formed(place, draft)
         return formed if math.isfinite(formed.value) else None
 
     def taken_back(self, place: Place) -> Place:

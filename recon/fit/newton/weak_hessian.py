@@ -115,15 +115,25 @@ class WeakHessian:
 
 def check_linear_response(microscope: Microscope, acquisition: Acquisition) -> None:
     """Raise ValueError where the images have no response to a weak specimen, or none of which a Hessian is made."""
-    needs, instead = "Newton's method needs the linear transfer", "use method 'adam'"
+    lacking = lacks_of_linear_response(microscope, acquisition)
+    if lacking is not None:
+        raise ValueError(f"Newton's method needs {lacking}; use method 'adam'")
+
+
+def lacks_of_linear_response(microscope: Microscope, acquisition: Acquisition, *, dark: bool = False) -> str | None:
+    """What the images lack of a weak specimen's response that a transfer function describes, in words; None: nothing.
+
+    dark: whether it may be 0, as with empty fields that are all dark.
+    """
     prisms = [prism for prism in acquisition.prisms if prism is not None]
     if prisms and not microscope.condenser_prism:
-        raise ValueError(f"{needs}: that of a prism asks for a condenser prism; {instead}")
+        return "a condenser prism, microscope.condenser_prism is false"
     if microscope.lenses is not None:
-        raise ValueError(f"{needs}, which can't hold a polarisation pupil; {instead}")
-    if not responds_linearly(microscope, acquisition):
+        return "a linear transfer, which can't hold microscope.polarisation.pupil"
+    if not dark and not responds_linearly(microscope, acquisition):
         biases = ", ".join(f"{number(prism.bias):g}" for prism in prisms)
-        raise ValueError(f"{needs}, and without bias there is none (biases {biases}); {instead}")
+        return f"a linear response, acquisition.prisms have biases {biases}"
+    return None
 
 
 def responds_linearly(microscope: Microscope, acquisition: Acquisition) -> bool:

@@ -25,6 +25,7 @@ GAUGES = (
     "a Δn that is the same everywhere (the volume's background is as told)",
     "focus against z: planes that are all moved by the same distance move the volume",
     "shear and bias reversed together: they give the same images",
+    "the sign of Δn: −Δn with reversed shears and planes gives the same images (bounds of Δn say which)",
 )
 
 # What a configuration may list as assumed, by the quantity that tells it.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from torchdic.errors import StackError, StackWarning
+from torchdic.files.arrangement.grey import coloured
 from torchdic.files.format import shape_text
 
 # tifffile's letters: Q and I are axes without a name; P, R and M are places of the stage, or tiles
@@ -42,7 +43,7 @@ def _check_axes(shape: tuple[int, ...], axes: str, path: Path) -> None:
         raise StackError(f"{path}: is no image ({axes}: {shape_text(shape)}); a stack has y and x")
     for axis, length in zip(axes, shape, strict=True):
         if axis == "S" and length > 1:
-            raise StackError(f"{path}: is a colour image, {length} samples per pixel; a stack is grey")
+            raise coloured(path, length)
 
 
 def _time_as_focus(shape: tuple[int, ...], axes: str, path: Path) -> str:

@@ -12,13 +12,18 @@ _GREY, _PALETTE = 1, 3  # PhotometricInterpretation: the value grows with the li
 _PHOTOMETRIC = {0: "0 is white", 2: "RGB", 3: "a colour palette", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}
 
 
+def coloured(path: Path, samples: int) -> StackError:
+    """The error for a colour image. samples: per pixel."""
+    return StackError(
+        f"{path}: is a colour image, {samples} samples per pixel; a stack is grey: in Fiji, Image > Type > 16-bit, or "
+        "Image > Color > Split Channels and the channel of the light's colour, then File > Save As > Tiff…"
+    )
+
+
 def check_grey(page: tifffile.TiffPage, path: Path) -> None:
     """Raise StackError where a page is coloured, or where its values do not grow with the light."""
     if page.samplesperpixel > 1:
-        raise StackError(
-            f"{path}: is a colour image, {page.samplesperpixel} samples per pixel; a stack is grey "
-            "(tifffile writes one with photometric='minisblack')"
-        )
+        raise coloured(path, page.samplesperpixel)
     if "PhotometricInterpretation" in page.tags and page.photometric not in (_GREY, _PALETTE):
         _refuse(page, path)
 
@@ -55,4 +60,5 @@ def greys_of_palette(data: np.ndarray, pages: list[tifffile.TiffPage], path: Pat
 
 def _refuse(page: tifffile.TiffPage, path: Path) -> None:
     kind = _PHOTOMETRIC.get(int(page.photometric), f"photometric interpretation {int(page.photometric)}")
-    raise StackError(f"{path}: is not greyscale ({kind}); a stack's values grow with the light")
+    grey = "; in Fiji, Image > Lookup Tables > Grays makes it one" if page.photometric == _PALETTE else ""
+    raise StackError(f"{path}: is not greyscale ({kind}); a stack's values grow with the light{grey}")
