@@ -473,6 +473,7 @@ def interrupted(path, out, number, wanted=12):
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         env=env,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background inherits a deaf ear
     )
     try:
         limit = time.monotonic() + 100
