@@ -270,7 +270,7 @@ def test_what_is_unusual_is_remarked_and_written(tmp_path, recording, capsys):
     words = ("--na", 0.5, "--condenser-na", 1.3, "--background", 2.4)
     assert new(written(recording, tmp_path), "--out", tmp_path / "run.toml", *words) == 0
     printed = capsys.readouterr().out
-    assert "warning: microscope.condenser.na: 1.3 is above the objective's NA 0.5, which is unusual: DIC" in printed
+    assert "warning: microscope.condenser.na: 1.3 is above microscope.objective.na 0.5, which is unusual" in printed
     assert "warning: volume.background: 2.4 is likely wrong" in printed
     with pytest.warns(UnlikelyWarning, match=r"condenser\.na: 1\.3|background: 2\.4"):
         assert load(tmp_path / "run.toml").volume.background == 2.4

@@ -97,7 +97,7 @@ def test_what_microscopists_use_is_neither_refused_nor_warned_of(changes):
         ({"microscope__wavelength": 1.3, "volume__background": 4.8, "calibration": {}}, "volume.background: 4.8"),
         ({"microscope__wavelength": 5.46}, "microscope.wavelength: 5.46 µm is likely wrong"),
         ({"microscope__objective": {"na": 0.08}, "microscope__condenser": {"na": 0.05}}, "objective.na: 0.08"),
-        ({"microscope__condenser": {"na": 1.3}}, "microscope.condenser.na: 1.3 is above the objective's NA 0.9"),
+        ({"microscope__condenser": {"na": 1.3}}, "microscope.condenser.na: 1.3 is above microscope.objective.na 0.9"),
         (
             {"volume__spacing": [0.4, 1.6, 1.6]},
             "volume.pixel_size (or spacing): 1.6 µm is likely wrong: that is 5 times the",

@@ -31,8 +31,7 @@ from recon.report.metrics import volume_error
 from recon.report.verdict import PoorFitWarning
 from recon.run import reconstruct, recorded, results
 from recon.run.checkpoint import CheckpointError
-from recon.run.data import load_data
-from torchdic import ApertureWarning, Grid, Volume, image
+from torchdic import Grid, Volume, image
 from torchdic.files.stack import read_stack, read_volume, write_stack
 
 GRID = Grid((5, 14, 12), (0.5, 0.2, 0.21))
@@ -440,13 +439,6 @@ def test_a_volume_that_cannot_be_judged_is_left(other, tmp_path, monkeypatch):
     monkeypatch.setattr(results, "model_images", no_images)
     with pytest.raises(ValueError, match=r"no light; go on with --resume; volume\.ome\.tif holds Δn so far"):
         reconstruct.reconstruct(load(other({"reconstruction": {"steps": 2}})), tmp_path / "out", torch.device("cpu"))
-
-
-@pytest.mark.filterwarnings("ignore::torchdic.errors.StackWarning")
-def test_a_condenser_open_beyond_the_objective_is_warned_of_by_its_keys_before_the_first_step(other):
-    said = r"microscope\.condenser\.na 1\.2 exceeds microscope\.objective\.na 0\.7: 66% of its light passes beside"
-    with pytest.warns(ApertureWarning, match=said):
-        load_data(load(other({"microscope": {"condenser": {"na": 1.2}}})))
 
 
 # interruptions

@@ -1,6 +1,5 @@
 """The measured stack that a configuration names, in the model's unit."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from recon.recording.masks import LeftOut, counted_pixels, left_out
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from recon.recording.support import edges_support
-from torchdic import Acquisition, ApertureWarning, Fidelity, Grid, Volume, image
+from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
 from torchdic.files.joined import read_joined
@@ -37,7 +36,6 @@ def load_data(config: Config) -> Measured:
     if section is None or not section.files:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     check_feasible(config)
-    _warn_of_dark_field(config)
     return prepared(config, read_joined(section.files, section.channels, section.series))
 
 
@@ -142,24 +140,6 @@ def check_feasible(config: Config) -> None:
     lacking = lacks_of_linear_response(config.microscope, config.acquisition, dark=method == "adam")
     if lacking is not None:
         raise ConfigError(f"{asks} {lacking}; {instead}")
-
-
-def _warn_of_dark_field(config: Config) -> None:
-    """Warn ApertureWarning of a condenser that is open beyond the objective, as no DIC condenser is."""
-    objective, condenser = config.microscope.objective, config.microscope.condenser
-    if objective is None or condenser is None or condenser.points is not None:
-        return
-    reach, open_to = (part.na for part in (objective, condenser.limited(config.volume.background)))
-    if open_to > reach:
-        inner = (condenser.inner_na or 0.0) ** 2
-        passing = max(reach**2 - inner, 0.0) / max(open_to**2 - inner, 1e-12)
-        warnings.warn(
-            f"microscope.condenser.na {condenser.na:g} exceeds microscope.objective.na {objective.na:g}: "
-            f"{1 - passing:.0%} of its light passes beside the objective, and the fit may fail; for DIC the condenser "
-            "is opened to some 0.6 to 1 times the objective's NA",
-            ApertureWarning,
-            stacklevel=3,
-        )
 
 
 def _empty_field(config: Config) -> list[float]:

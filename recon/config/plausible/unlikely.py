@@ -83,10 +83,16 @@ def _apertures(config: Config) -> Iterator[str]:
         return
     if objective.na < _LEAST_NA:
         yield f"microscope.objective.na: {objective.na:g} is likely wrong: DIC's objectives have {_LEAST_NA:g} or more"
-    if condenser is not None and condenser.points is None and number(condenser.na) > _WIDER * objective.na:
+    if condenser is None or condenser.points is not None:
+        return
+    na, reach = condenser.limited(config.volume.background).na, objective.na
+    if na > _WIDER * reach:
+        inner = (condenser.inner_na or 0.0) ** 2
+        beside = 1 - max(reach**2 - inner, 0.0) / (na**2 - inner)
         yield (
-            f"microscope.condenser.na: {number(condenser.na):g} is above the objective's NA {objective.na:g}, which is "
-            "unusual: DIC wants the condenser's NA at or below the objective's"
+            f"microscope.condenser.na: {condenser.na:g} is above microscope.objective.na {reach:g}, which is unusual: "
+            f"{beside:.0%} of its light passes beside the objective; for DIC a condenser is opened to 0.6 to 1 times "
+            "the objective's NA"
         )
 
 
