@@ -133,9 +133,9 @@ def test_the_objective_of_a_given_weight_never_rises(prior, height):
     setup = setup_of(bead(height))
     data, _ = recorded(setup, 0.2)
     weight = 0.5 / height
-    recipe = Recipe(tv=(weight, weight), l1=weight / 4, prior=prior, steps=18)
+    recipe = Recipe(tv=(weight, weight), l1=weight / 4, prior=prior, steps=20)
     losses = [step.loss for step in fitted(data, setup, recipe, replace(FIDELITY, order=1))]
-    settled = losses if prior == "tv" else losses[10:]
+    settled = losses if prior == "tv" else losses[14:]
     assert all(after <= before * (1 + 1e-6) for before, after in pairwise(settled))
     assert losses[-1] < 0.3 * losses[0]
 
@@ -341,7 +341,7 @@ def test_masked_pixels_play_no_part(scene, plain):
     mask = torch.ones_like(data, dtype=torch.bool)
     mask[:, :, 2:5, 3:6] = False
     wild = torch.where(mask, data, 50.0)
-    steps = [fitted(d, setup, Recipe(steps=8), misfit=lambda x: GaussianMisfit(x, mask=mask)) for d in (data, wild)]
+    steps = [fitted(d, setup, Recipe(steps=12), misfit=lambda x: GaussianMisfit(x, mask=mask)) for d in (data, wild)]
     assert torch.equal(steps[0][-1].delta, steps[1][-1].delta)
     assert error(steps[0], delta) < error(plain, delta) + 0.1
 
@@ -486,13 +486,14 @@ def test_a_step_whose_careful_images_cannot_be_computed_is_taken_back(scene, mon
             raise UnstableError("slabs make energy")
         return renewed(self, *given)
 
-    monkeypatch.setattr(Correction, "renewed", once)
     recipe = Recipe(draft_sources=8, steps=COARSE_STEPS + 6)
+    undisturbed = fitted(data, setup, recipe, Fidelity(sources=18))
+    monkeypatch.setattr(Correction, "renewed", once)
     steps = fitted(data, setup, recipe, Fidelity(sources=18))
     assert wild
     back = [torch.equal(one.delta, other.delta) for one, other in pairwise(steps)]
     assert any(back)
-    assert steps[-1].misfit < steps[COARSE_STEPS].misfit
+    assert steps[-1].misfit == pytest.approx(undisturbed[-1].misfit, rel=0.03)
 
 
 @pytest.mark.slow

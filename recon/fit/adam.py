@@ -14,7 +14,7 @@ from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import WeightRecord, record, whiteness
+from recon.prior.weight import BEGUN, WeightRecord, record, whiteness
 from torchdic.errors import UnstableError
 
 # Share of the steps before the priors know the specimen's contrast, and steps between two weights that follow the
@@ -95,7 +95,7 @@ def _first_weight(problem: Problem, unknowns: Unknowns) -> tuple[WeightRecord, .
     if rule is None:
         return ()
     found = contrast(unknowns.into(problem.setup).volume.delta.detach())
-    first = rule.first if rule.first is not None else 1 / (EDGE * max(found, 1e-4))
+    first = rule.first if rule.first is not None else BEGUN / max(found, 1e-4)
     return (record(0, first, "by the contrast"),)
 
 

@@ -21,6 +21,9 @@ from torch import Tensor
 
 from recon.misfit.base import Misfit
 
+# The weight at first times the specimen's contrast.
+BEGUN = 2.0
+
 # Part of what isn't noise that even the best volume leaves: voxels and directions are finite.
 MODEL = 5e-4
 

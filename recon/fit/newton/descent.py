@@ -33,7 +33,7 @@ from recon.fit.unknowns import IndexDifference, check_saved, with_values
 from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import WeightRecord, record, whiteness
+from recon.prior.weight import BEGUN, WeightRecord, record, whiteness
 from torchdic import Fidelity
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
@@ -50,7 +50,7 @@ SHORTER, LONGER, BACK = 2.0, 0.4, 4.0
 UNTIL_CONTRAST, UNTIL_WEIGHT = 3, 2
 
 # Edges are wide at first, by this factor from one accepted step to the next: a logarithm at once keeps false edges.
-WIDE, NARROWER = 1.0 / EDGE, 0.85
+WIDE, NARROWER = 1.0 / EDGE, 0.75
 
 # Steps with the fewest directions.
 COARSE_STEPS = 4
@@ -334,7 +334,7 @@ class _Descent:
         scale = contrast(self.bounds.clamped(linear))
         scale = max(scale, contrast(linear) * 1e-3, 1e-9)
         first = None if problem.weight is None else problem.weight.first
-        weight = first if first is not None else 1 / (EDGE * scale)
+        weight = first if first is not None else BEGUN / scale
         return replace(place, scale=scale, weight=weight), hessian, now
 
     def turned(self, place: Place, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
