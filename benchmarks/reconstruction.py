@@ -32,12 +32,13 @@ from recon.earlier.path_length import path_length
 from recon.earlier.tikhonov import tikhonov
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
-from recon.fit.newton import descent
+from recon.fit.newton import correction, descent
 from recon.fit.newton.secants import Secants
 from recon.fit.problem import Problem, Recipe, measured_noise
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
+from recon.prior import edges
 from recon.recording.cut_field import needed_margin
 from recon.recording.masks import LeftOut, left_out
 from recon.recording.preparation import ExpectedStack, prepare
@@ -172,8 +173,19 @@ def ablation(options: argparse.Namespace) -> None:
         ("40 steps", replace(usual, steps=40), None),
     )
     table("without", ways, options)
-    with patch.object(descent, "Secants", lambda hessian, _: Secants(hessian, ())):
-        table("without", (("no secants: the weak Hessian alone", usual, None),), options, head=False)
+    without = (
+        ("no secants: the weak Hessian alone", descent, "Secants", lambda hessian, _: Secants(hessian, ())),
+        ("drafts that don't follow the volume", correction, "share_of", lambda *_: 0.0),
+        ("each edge by itself", edges, "among_neighbours", _by_themselves),
+    )
+    for name, module, part, other in without:
+        with patch.object(module, part, other):
+            table("without", ((name, usual, None),), options, head=False)
+
+
+def _by_themselves(lengths: Tensor) -> Tensor:
+    """In the place of `among_neighbours`: lengths of all corners stay, and so do weights."""
+    return lengths if len(lengths) == len(edges.CORNERS) else lengths[0]
 
 
 def table(
