@@ -18,8 +18,9 @@ from torchdic.planning.cost import directions, seconds, work
 from torchdic.scalar import number
 
 # What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
-# direction; the weak specimen's Hessian of some directions, in images of them; how often the correction is renewed.
-WITH_GRADIENT, MODEL, HESSIAN, RENEWED = 2.75, 100.0, 15.0, 1 / 3
+# direction; the weak specimen's Hessian of some directions, in images of them; how often the correction is renewed; and
+# what draft images miss of the careful ones, to first order, in images of both.
+WITH_GRADIENT, MODEL, HESSIAN, RENEWED, MISSED = 2.75, 100.0, 15.0, 1 / 3, 3.0
 # Steps whose seconds are averaged.
 LAST = 3
 
@@ -98,7 +99,8 @@ def _cost(problem: Problem, number: int) -> float:
     if number in (0, COARSE_STEPS):
         cost += HESSIAN * each
     if number >= COARSE_STEPS and fine != careful:
-        cost += work(careful, *scene) * (1 if number == COARSE_STEPS else RENEWED)
+        exact = work(careful, *scene)
+        cost += exact + MISSED * (exact + each) if number == COARSE_STEPS else RENEWED * exact
     return cost
 
 
