@@ -9,6 +9,9 @@ from scipy import ndimage
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
 
+# The largest part of a setting's pixels that may be saturated or stuck: of more nothing could be said by the others.
+MOST_SATURATED = 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
@@ -84,7 +87,7 @@ def counted_pixels(
         counted = counted & ~stuck
     for prism, images in enumerate(counted):
         if not images.any():
-            raise StackError(f"{stack.source}: no pixel of prism {prism} counts: all are saturated or masked")
+            raise StackError(f"{stack.source}: no pixel of prism {prism + 1} counts: all are saturated or masked")
     return None if counted.all() else counted
 
 

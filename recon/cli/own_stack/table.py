@@ -54,7 +54,8 @@ def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:
         shown = f"{length.value:g} µm, {angle.value:g}° {sure}".rstrip()
         origins = f"length {length.origin}, angle {angle.origin} (towards {angle_in_words(angle.value)})"
         yield f"shear{which}", shown, origins
-        yield f"bias{which}", f"{bias.value:g}°", bias.origin
+        inferred = bias.origin == "measured" and bias.value
+        yield f"bias{which}", f"{bias.value:g}°", "size given, sign measured" if inferred else bias.origin
 
 
 def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[Row]:
@@ -100,6 +101,7 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
         yield f"the planes' brightness differs by {flicker:.1%}; it is fitted"
     if found.saturated > _SATURATED * gathered.stack.data.size:
         yield f"warning: {found.saturated / gathered.stack.data.size:.1%} of the pixels are saturated"
+    yield from settled.remarks
     yield from _of_given_angles(found, settled)
 
 
