@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -190,11 +191,24 @@ def test_init_is_an_alias(tmp_path, recording):
 
 def test_several_files_are_joined_beside_the_configuration(tmp_path, recording):
     folder = written(recording, tmp_path, "folder")
-    assert new(*folder.glob("*.tif"), "--out", tmp_path / "runs" / "run.toml", "--pixel-size", 0.15) == 0
+    assert new(*sorted(folder.glob("*.tif")), "--out", tmp_path / "runs" / "run.toml", "--pixel-size", 0.15) == 0
     joined = read_stack(tmp_path / "runs" / "run.stack.ome.tif")
     assert np.array_equal(joined.data, recording.data)
     assert joined.pixel_size == (0.15, 0.15)
     assert 'path = "run.stack.ome.tif"' in (tmp_path / "runs" / "run.toml").read_text()
+
+
+def test_which_file_is_which_setting_is_said(tmp_path, recording, capsys):
+    for name, images in zip(("b_plus.tif", "a_minus.tif"), recording.data, strict=True):
+        write_stack(tmp_path / name, images, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "b_plus.tif", tmp_path / "a_minus.tif", "--out", tmp_path / "run.toml") == 0
+    said, text = capsys.readouterr().out, (tmp_path / "run.toml").read_text()
+    assert re.search(r"setting 1 +b_plus\.tif .*\n +setting 2 +a_minus\.tif ", said)
+    assert "# setting 1, b_plus.tif: length" in text
+    assert "# setting 2, a_minus.tif: length" in text
+    joined = read_stack(tmp_path / "run.stack.ome.tif")
+    assert np.array_equal(joined.data, recording.data)
+    assert joined.names == ("b_plus.tif", "a_minus.tif")
 
 
 def test_one_plane_has_one_slice(tmp_path):

@@ -50,13 +50,21 @@ def left_out(
     """The pixels of a stack that a fit leaves out: by a user's mask, because they are saturated, and the stuck ones.
 
     mask: True where a pixel counts, as of `counted_pixels`. stuck: True where a pixel of the camera is, see
-    `recon.recording.stuck_pixels`. Raises StackError as `counted_pixels` does.
+    `recon.recording.stuck_pixels`. Raises StackError as `counted_pixels` does, and where more than half of a prism's
+    pixels are saturated or stuck among those that the mask leaves: the others would be explained by nearly any volume.
     """
     counted = counted_pixels(stack, mask, stuck)
     if counted is None:
         return LeftOut()
     wanted = np.ones(counted.shape, bool) if mask is None else np.broadcast_to(mask, counted.shape)
     sound = wanted if stuck is None else wanted & ~stuck
+    for prism, (kept, images) in enumerate(zip(wanted, counted, strict=True), start=1):
+        lost = int((kept & ~images).sum())
+        if lost > MOST_SATURATED * kept.sum():
+            raise StackError(
+                f"{stack.source}: {lost / kept.sum():.1%} of prism {prism}'s pixels are saturated or stuck: at most "
+                f"{MOST_SATURATED:.0%} may be left out so; the others say too little of a volume"
+            )
     number = 0 if stuck is None else int(stuck.sum())
     return LeftOut(
         counted,

@@ -90,4 +90,5 @@ def _join(gathered: Gathered, settled: Settled, path: Path) -> None:
         None if settled.pixel_size.origin == "assumed" else (pixel, pixel),
         settled.step.value if known else None,
         bits=stack.bits,
+        names=stack.names,
     )

@@ -26,7 +26,7 @@ def summary(path: Path, gathered: Gathered, found: Survey, settled: Settled) -> 
         f"{path}, for {gathered.stack.source}: {_counted(settings, 'prism setting')} × {_counted(planes, 'plane')} × "
         f"{height} × {width} pixels"
     )
-    rows = [*_said(gathered, settled), *_measured(gathered, found, settled)]
+    rows = [*_named(gathered), *_said(gathered, settled), *_measured(gathered, found, settled)]
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     lines = [f"  {what:<{widths[0]}}  {value:<{widths[1]}}  {origin}" for what, value, origin in rows]
     return "\n".join([head, "", *lines])
@@ -35,6 +35,14 @@ def summary(path: Path, gathered: Gathered, found: Survey, settled: Settled) -> 
 def warnings_of(gathered: Gathered, found: Survey, settled: Settled) -> list[str]:
     """What the user should know before a reconstruction, a line each; the first is of what is assumed."""
     return list(_warned(gathered, found, settled))
+
+
+def _named(gathered: Gathered) -> Iterator[Row]:
+    """Which file, or which of a file's channels, each setting is."""
+    names = gathered.stack.names
+    for number, name in enumerate(names if len(names) > 1 else (), start=1):
+        if name != f"setting {number}":
+            yield f"setting {number}", name, "file" if gathered.one_file else "in the order of the files"
 
 
 def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:

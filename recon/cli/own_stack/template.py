@@ -50,9 +50,10 @@ def _acquisition(gathered: Gathered, found: Survey, settled: Settled) -> list[Li
     prisms = []
     for number, (length, angle, bias) in enumerate(settled.prisms):
         value = {"shear": {"length": length.value, "angle_degrees": angle.value}, "bias_degrees": bias.value}
-        setting = f"{names[number]}: " if names and names[number] else ""
+        setting = f"setting {number + 1}"
+        named = f", {names[number]}" if names and names[number] not in ("", setting) else ""
         words = [each.origin if number and each.origin != "measured" else each.comment for each in (length, bias)]
-        prisms.append(Line("", value, f"{setting}length {words[0]}; angle {angle.comment}; bias {words[1]}"))
+        prisms.append(Line("", value, f"{setting}{named}: length {words[0]}; angle {angle.comment}; bias {words[1]}"))
     planes = gathered.stack.data.shape[1]
     sharpest = f"{settled.first + found.sharpest * settled.step.value:.3g}"
     comment = (
