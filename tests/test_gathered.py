@@ -72,6 +72,9 @@ def test_settings_are_in_the_order_typed(tmp_path):
     stack = gather(sorted(folder.iterdir(), reverse=True)).stack
     assert np.array_equal(stack.data, STACK)
     assert stack.names == ("plus_1.tif to plus_12.tif", "minus_1.tif to minus_12.tif")
+    pair = planes(tmp_path / "pair", lambda s, _: f"cell {('plus', 'minus')[s]}.tif", STACK[:, :1])
+    stack = gather([pair / "cell plus.tif", pair / "cell minus.tif"]).stack
+    assert np.array_equal(stack.data, STACK[:, :1])
 
 
 def test_a_file_that_is_named_twice_is_refused(tmp_path, monkeypatch):

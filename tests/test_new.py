@@ -258,8 +258,8 @@ REFUSALS = {
         "640",
     ): "--z-step: 640 µm is no distance between focus planes (0.001 to 100 µm); lengths are in",
     ("--shear-angle", "10", "20", "30"): "--shear-angle 10 20 30: 3 angles, and the images show one axis of shear in 2",
-    ("--shear-angle", "999"): "--shear-angle: 999 ° is no angle of at most a turn",
-    ("--bias", "400"): "--bias: 400 ° is no angle of at most a turn",
+    ("--shear-angle", "999"): "--shear-angle: 999° is no angle of at most a turn",
+    ("--bias", "400"): "--bias: 400° is no angle of at most a turn",
     ("--bias", "65", "-65", "65"): "--bias 65 -65 65: 3 biases for 2 prism settings: give one, or one for each",
     ("--wavelength", "546"): "546 µm is no wavelength of light (0.01 to 20 µm); lengths are in µm: 546 nm are 0.546 µm",
     ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",
@@ -565,6 +565,30 @@ def test_a_setting_of_one_value_is_refused(tmp_path, recording, capsys):
     write_stack(tmp_path / "s.tif", data, (0.15, 0.15), 0.4)
     assert new(tmp_path / "s.tif", "--out", tmp_path / "run.toml") == 2
     assert "all pixels of setting 2 are 300: nothing is recorded in them" in capsys.readouterr().err
+
+
+def test_images_that_show_nothing_are_warned_of_in_one_line(tmp_path, capsys):
+    noise = np.random.default_rng(1).normal(500, 23, (2, 5, 48, 48)).astype(np.uint16)
+    said = {}
+    for name, data in (("noise", noise), ("small", noise[..., :7, :9])):
+        write_stack(tmp_path / f"{name}.tif", data, (0.15, 0.15), 0.4)
+        assert new(tmp_path / f"{name}.tif", "--out", tmp_path / f"{name}.toml") == 0
+        said[name] = capsys.readouterr().out
+        assert re.search("sharpest plane +not seen", said[name])
+        assert "the sharpest is" not in (tmp_path / f"{name}.toml").read_text()
+    assert said["noise"].count("warning:") == said["small"].count("warning:") == 1
+    assert (
+        "warning: the images show no shear's direction, as of an empty field, of noise or of too faint" in said["noise"]
+    )
+    assert "warning: images of 7 × 9 pixels are too small to tell background, noise and shear" in said["small"]
+
+
+def test_a_bias_of_0_on_a_bright_background_is_warned_of(tmp_path, recording, capsys):
+    words = (written(recording, tmp_path), "--out", tmp_path / "run.toml", "--bias", 0)
+    assert new(*words) == 0
+    said = capsys.readouterr().out
+    assert "warning: --bias 0 makes an empty field dark, but setting 1's background is" in said
+    assert "warning: --bias 0 makes an empty field dark, but setting 2's background is" in said
 
 
 def test_the_angle_is_as_uncertain_as_its_settings_are_apart():

@@ -161,6 +161,8 @@ def _layout(files: Sequence[Path], *, typed: bool) -> tuple[list[int], list[int]
         raise StackError(f"{files[0].parent}: the names differ in more than numbers and words: {_two(files)}")
     changing = [i for i in range(len(parts[0])) if len({name[i] for name in parts}) > 1]
     prism = next((i for i in changing if _counts(parts[0], i, _OF_PRISMS)), None)
+    if prism is None and len(changing) == 1 and not parts[0][changing[0]].isdigit():
+        prism = changing[0]  # a word alone, such as plus and minus
     if prism is None and len(changing) == 2:
         words = [i for i in changing if not parts[0][i].isdigit()]
         of_planes = [i for i in changing if _counts(parts[0], i, _OF_PLANES)]

@@ -127,10 +127,10 @@ def _biases(told: Sequence[float], places: Places) -> list[Sourced]:
         if not sign:
             dark = "its empty field is dark beside another setting's"
             biases.append(size if told else Sourced(0.0, "measured", dark, name))
-        elif told and axis in begun:
+        elif told and axis in begun and size.value:  # 0 has no sign
             biases.append(Sourced(sign * size.value, "measured", "its sign; its size is given", name))
         else:
-            biases.append(replace(size, value=sign * size.value))
+            biases.append(replace(size, value=sign * size.value or 0.0))
         begun |= {axis} if sign else set()
     return biases
 

@@ -4,7 +4,7 @@ import math
 
 from recon.cli.own_stack.settled import Settled
 from recon.config.commented import Line, Sourced, commented
-from recon.recording.survey.survey import Survey
+from recon.recording.survey.survey import Survey, shows_edges
 from torchdic import __version__
 from torchdic.files.gathered import Gathered
 
@@ -55,10 +55,11 @@ def _acquisition(gathered: Gathered, found: Survey, settled: Settled) -> list[Li
         words = [each.origin if number and each.origin != "measured" else each.comment for each in (length, bias)]
         prisms.append(Line("", value, f"{setting}{named}: length {words[0]}; angle {angle.comment}; bias {words[1]}"))
     planes = gathered.stack.data.shape[1]
-    sharpest = f"{settled.first + found.sharpest * settled.step.value:.3g}"
+    depth = f"{settled.first + found.sharpest * settled.step.value:.3g}"
+    sharpest = f"; measured: the sharpest is number {found.sharpest + 1}, at {depth}" if shows_edges(found) else ""
     comment = (
         f"step {settled.step.comment}; assumed: the first plane is where light enters, else make step and first "
-        f"change their signs; measured: the sharpest is number {found.sharpest + 1}, at {sharpest}"
+        f"change their signs{sharpest}"
     )
     focus = {"first": settled.first, "step": settled.step.value, "count": planes}
     return [

@@ -65,6 +65,11 @@ class Survey:
     saturated: int
 
 
+def shows_edges(found: Survey) -> bool:
+    """Whether any setting's images show a direction of shear, as the edges of a specimen do."""
+    return any(setting.direction is not None for setting in found.settings)
+
+
 def survey(stack: Stack, ratio: float) -> Survey:
     """Look through a stack.
 
