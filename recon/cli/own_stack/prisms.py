@@ -121,7 +121,8 @@ def _biases(told: Sequence[float], places: Places) -> list[Sourced]:
                 "settings: give one, or one for each setting"
             )
         return [Sourced(float(bias), "given", name=name) for bias in told]
-    size = chosen(*told or [None], None, _BIAS_DEGREES, name, "a quarter wave; the compensator shows it")
+    given = told[0] if told else None
+    size = chosen(given, None, _BIAS_DEGREES, name, "a quarter wave; the compensator shows it")
     biases, begun = [], set()
     for axis, sign in places:
         if not sign:
