@@ -118,7 +118,8 @@ def _offset(stack: Stack, camera: DarkCounts | None, given: float | None) -> Sou
     """The counts of a dark image."""
     name = "camera's offset"
     if given is not None:
-        return Sourced(float(given), "given", "counts in the dark", name)
+        why = "counts in the dark" if given >= 0 else "what was subtracted from the images is put back"
+        return Sourced(float(given), "given", why, name)
     if not stack.is_integer:
         return None
     if camera is not None and camera.offset_is_seen:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.cli.own_stack.settled import Settled
-from recon.cli.own_stack.template import angle_in_words
+from recon.cli.own_stack.template import angle_in_words, name_of_setting
 from recon.config.commented import Sourced
 from recon.recording.survey.survey import Survey, shows_edges
 from torchdic.files.gathered import Gathered
@@ -47,10 +47,10 @@ def warnings_of(gathered: Gathered, found: Survey, settled: Settled) -> list[str
 
 def _named(gathered: Gathered) -> Iterator[Row]:
     """Which file, or which of a file's channels, each setting is."""
-    names = gathered.stack.names
-    for number, name in enumerate(names if len(names) > 1 else (), start=1):
-        if name != f"setting {number}":
-            yield f"setting {number}", name, "file" if gathered.one_file else "in the order of the files"
+    settings = len(gathered.stack.data)
+    for number in range(settings if settings > 1 else 0):
+        if name := name_of_setting(gathered, number):
+            yield f"setting {number + 1}", name, "file" if gathered.one_file else "in the order of the files"
 
 
 def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:
