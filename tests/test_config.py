@@ -298,7 +298,7 @@ def test_a_key_that_is_unknown_or_missing_is_named(write, key, value, message):
         ("microscope.objective", 0.9, "must be a table"),
         ("specimen", "bead", "must be a table"),
         ("reconstruction.bounds", [0, 1], "must be a table"),
-        ("volume.background", "1.5", "must be a number"),
+        ("volume.background", "1.5", "must be one of 'air' (1.0003), "),
         ("volume.background", True, "must be a number"),
         ("microscope.objective.na", [0.9], "must be a number"),
         ("volume.shape", 6, "must be an array of 3 values"),

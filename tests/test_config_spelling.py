@@ -138,7 +138,7 @@ def test_what_is_said_twice_half_or_wrongly_is_refused(write, given, message):
             "180 nm are 0.18 µm",
         ),
         ({"bias": "bias = 70"}, "acquisition.prisms[0].bias: 70 rad", "or bias_degrees = 70"),
-        ({"bias": "bias_degrees = 4000"}, "acquisition.prisms[0].bias_degrees: 4000 °", "at most 360 °"),
+        ({"bias": "bias_degrees = 4000"}, "acquisition.prisms[0].bias_degrees: 4000°", "at most 360°"),
     ],
 )
 def test_another_unit_is_named_in_the_spelling_that_was_used(write, given, named, meant):
@@ -173,6 +173,12 @@ def test_a_layer_by_the_names_of_its_media_is_one_by_their_indices(write, layer)
         "index": 1.3345,
         "design_index": 1.518,
     }
+
+
+def test_a_background_by_the_name_of_its_medium_is_one_by_its_index(write):
+    assert load(write(text().replace("1.335", "'water'"))).volume.background == MEDIA["water"]
+    message = the_error(write(text().replace("1.335", "'watre'")))
+    assert message.startswith("volume.background: 'watre' must be one of 'air' (1.0003), 'water' (1.3345), ")
 
 
 def test_an_included_layers_medium_is_replaced_in_either_spelling(write):

@@ -311,7 +311,7 @@ def test_a_weak_specimen_is_not_sought_where_there_is_no_linear_response():
     with pytest.raises(ValueError, match="can't hold a polarisation pupil"):
         tikhonov(data, replace(setup, microscope=microscope), 1e-4)
     unbiased = Acquisition((PRISMS[0], Prism((0.2, 0.0), 2 * math.pi)), FOCUS)
-    with pytest.raises(ValueError, match=r"prism 1 \(bias 6.28319\) has no linear response"):
+    with pytest.raises(ValueError, match=r"prism 2 \(bias 6.28319\) has no linear response"):
         tikhonov(data, replace(setup, acquisition=unbiased), 1e-4)
 
 

@@ -90,7 +90,7 @@ def test_a_given_scale_stays(truth, shape):
 
 def test_one_image_serves_all_prisms_by_its_shape(truth, shape):
     single = Stack(field_of(shape, 3).data[:1], source="empty.tif")
-    with pytest.warns(StackWarning, match="prism 1's background is 500.*the empty field gives"):
+    with pytest.warns(StackWarning, match="prism 2's background is 500.*the empty field gives"):
         measured = divided(counted(truth, shape), single)
     assert measured.data == pytest.approx(truth, abs=2e-3)
 
@@ -150,7 +150,7 @@ def test_dead_hot_and_saturated_pixels_are_bad(truth, shape):
     [
         (np.full((1, 1, ROWS, COLUMNS - 1), 900), "empty.tif has 48 × 51 pixels (y × x), stack.tif 48 × 52"),
         (np.full((3, 1, ROWS, COLUMNS), 900), "empty.tif has 3 channels: an empty field has one, or one for each of 2"),
-        (np.full((1, 1, ROWS, COLUMNS), 90), "the empty field of prism 0 minus the offset 100 is -10: it must be"),
+        (np.full((1, 1, ROWS, COLUMNS), 90), "the empty field of prism 1 minus the offset 100 is -10: it must be"),
         (np.full((1, 1, ROWS, COLUMNS), 65535), "100% of the empty field are dark, hot or saturated"),
     ],
 )

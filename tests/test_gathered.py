@@ -54,9 +54,36 @@ def test_planes_come_in_the_natural_order_of_their_names(tmp_path):
 def test_files_of_several_planes_are_a_setting_each(tmp_path):
     for setting, images in enumerate(STACK):
         write_stack(tmp_path / f"bias{setting}.ome.tif", images, (0.1, 0.1), 0.5)
-    stack = gather(list(tmp_path.iterdir())).stack
+    stack = gather(sorted(tmp_path.iterdir())).stack
     assert np.array_equal(stack.data, STACK)
     assert (stack.pixel_size, stack.focus_step) == ((0.1, 0.1), 0.5)
+
+
+def test_settings_are_in_the_order_typed(tmp_path):
+    """Planes stay in the order of their numbers."""
+    for name, images in zip(("b_plus", "a_minus"), STACK, strict=True):
+        write_stack(tmp_path / f"{name}.tif", images, (0.1, 0.1), 0.5)
+    stack = gather([tmp_path / "b_plus.tif", tmp_path / "a_minus.tif"]).stack
+    assert np.array_equal(stack.data, STACK)
+    assert stack.names == ("b_plus.tif", "a_minus.tif")
+    assert stack.source == f"{tmp_path / 'b_plus.tif'} and {tmp_path / 'a_minus.tif'}"
+    assert gather([tmp_path]).stack.names == ("a_minus.tif", "b_plus.tif")
+    folder = planes(tmp_path / "planes", lambda s, p: f"{('plus', 'minus')[s]}_{p + 1}.tif")
+    stack = gather(sorted(folder.iterdir(), reverse=True)).stack
+    assert np.array_equal(stack.data, STACK)
+    assert stack.names == ("plus_1.tif to plus_12.tif", "minus_1.tif to minus_12.tif")
+    pair = planes(tmp_path / "pair", lambda s, _: f"cell {('plus', 'minus')[s]}.tif", STACK[:, :1])
+    stack = gather([pair / "cell plus.tif", pair / "cell minus.tif"]).stack
+    assert np.array_equal(stack.data, STACK[:, :1])
+
+
+def test_a_file_that_is_named_twice_is_refused(tmp_path, monkeypatch):
+    write_stack(tmp_path / "a.tif", STACK[:1], (0.1, 0.1), 0.5)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        StackError, match=r"a\.tif: is named twice; each file is a prism setting, or a plane, of its own"
+    ):
+        gather([Path("a.tif"), tmp_path / "a.tif"])
 
 
 def test_one_file_is_read_as_it_is(tmp_path):

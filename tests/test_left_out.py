@@ -156,7 +156,21 @@ def test_a_mask_that_leaves_nothing_is_refused_in_one_line(run, counts):
     code, _, err, *_ = run(counts, section={"mask": "mask.tif"}, files={"mask.tif": np.zeros((32, 30), np.uint8)})
     assert code == 2
     assert err.count("\n") == 1
-    assert "no pixel of prism 0 counts" in err
+    assert "no pixel of prism 1 counts" in err
+
+
+def test_a_stack_of_which_most_is_saturated_is_refused_in_one_line(run, counts):
+    """Nearly any volume would explain what is left; what the user's mask leaves out isn't counted."""
+    data = spoiled(counts)
+    data[1, :, :18] = 65535
+    code, _, err, *_ = run(data)
+    assert code == 2
+    (line,) = [line for line in err.splitlines() if "error" in line]
+    assert "of prism 2's pixels are saturated or stuck: at most 50% may be left out so" in line
+    stack = Stack(data)
+    mask = np.ones(data.shape, bool)
+    mask[:, :, :18] = False
+    assert left_out(stack, mask).share > 0.5
 
 
 def test_another_mask_is_another_descent(run, counts, monkeypatch):

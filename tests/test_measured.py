@@ -140,7 +140,7 @@ def test_floats_are_left_alone():
 
 def test_floats_that_look_like_counts_are_warned_of():
     stack = Stack(np.full((1, 1, 8, 6), 1234.0), source="stack.tif")
-    with pytest.warns(StackWarning, match=r"stack\.tif: prism 0's background is 1234, not 0\.5"):
+    with pytest.warns(StackWarning, match=r"stack\.tif: prism 1's background is 1234, not 0\.5"):
         prepared(stack, [RIGHT], [0.0], (0.1, 0.1))
     assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale=2468.0).data == pytest.approx(0.5)
     assert prepared(stack, [RIGHT], [0.0], (0.1, 0.1), scale="background").data == pytest.approx(0.5)
@@ -155,7 +155,7 @@ def test_floats_of_another_background_than_the_models_are_warned_of_both_ways(ch
     data = np.full((1, 3, 12, 16), 0.5)
     data[0, 1, 4:7, 5:9] = 0.8
     stack = Stack(change(data), source="stack.tif")
-    said = rf"stack\.tif: prism 0's background is {found}, not 0\.5 as the model's.*data\.scale = 'background'"
+    said = rf"stack\.tif: prism 1's background is {found}, not 0\.5 as the model's.*data\.scale = 'background'"
     with pytest.warns(StackWarning, match=said):
         prepared(stack, [RIGHT], range(3), (0.1, 0.1))
     back = 0.0 if change(0.5) > 0 else -0.5
@@ -246,7 +246,7 @@ def test_counts_at_extinction_need_a_scale(bias):
     light = np.zeros((32, 48))
     light[10:14, 20:25] = 500
     stack = Stack((stray + light).astype(np.uint16)[None, None], source="stack.tif")
-    with pytest.raises(StackError, match=r"stack\.tif: prism 0 .*too dark to scale by; give scale"):
+    with pytest.raises(StackError, match=r"stack\.tif: prism 1 .*too dark to scale by; give scale"):
         prepared(stack, [bias], [0.0], (0.1, 0.1))
     ready = prepared(stack, [bias], [0.0], (0.1, 0.1), scale=1000, offset=100)
     # stray light is additive: subtracted, so that the specimen's own light stays what it was, on the model's background
@@ -415,6 +415,6 @@ def test_a_dark_frame_has_the_scale_of_the_others():
     light = empty + 0.1 * random.random((3, 2, 20, 20)) * (np.arange(20) < 5)
     stack = Stack((100 + 20000 * light).round().astype(np.uint16), source="stack.tif")
     expected = ExpectedStack(biases, (0.0, 1.0), (0.1, 0.1))
-    with pytest.warns(StackWarning, match=r"prism 1's empty field is dark and tells no scale: .* 2e\+04 per empty"):
+    with pytest.warns(StackWarning, match=r"prism 2's empty field is dark and tells no scale: .* 2e\+04 per empty"):
         measured = prepare(stack, expected, Normalisation(offset=100.0, order=0))
     assert measured.data == pytest.approx(light, abs=1e-3)

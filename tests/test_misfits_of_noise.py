@@ -264,7 +264,7 @@ def test_a_scale_from_the_residual_is_its_median():
         expected = RobustMisfit(data, torch.tensor([0.3007, 0.102], dtype=torch.float64), mask)
         assert float(wide(images)) == pytest.approx(float(expected(images)), rel=0.03)
         assert wide.of_noise() == pytest.approx(expected.of_noise([0.02, 0.02]), rel=0.06)
-    with pytest.raises(ValueError, match=r"the residual's median in prism 0 is 0: it gives no scale"):
+    with pytest.raises(ValueError, match=r"the residual's median in prism 1 is 0: it gives no scale"):
         RobustMisfit(data).rescaled(data)
 
 
@@ -367,7 +367,7 @@ def no_pixel():
     [
         (lambda: GaussianMisfit(not_finite()), "1 of 288 pixels are not finite; a mask must leave them out"),
         (lambda: GaussianMisfit(DATA, mask=torch.ones(2, 2, 8, 9)), "the mask holds float32, a mask is boolean"),
-        (lambda: GaussianMisfit(DATA, mask=no_pixel()), "the mask leaves no pixel of prism 1: there is nothing to fit"),
+        (lambda: GaussianMisfit(DATA, mask=no_pixel()), "the mask leaves no pixel of prism 2: there is nothing to fit"),
         (
             lambda: GaussianMisfit(DATA, mask=torch.ones(3, 9, dtype=torch.bool)),
             r"the mask has shape \(3, 9\), the data \(2, 2, 8, 9\)",
@@ -380,9 +380,9 @@ def no_pixel():
             lambda: PoissonMisfit(DATA, NoiseModel(1.0, torch.ones(5, 1))),
             r"the read noise has shape \(5, 1\), the data \(2, 2, 8, 9\)",
         ),
-        (lambda: RobustMisfit(DATA, torch.tensor([0.1, 0.0])), "the noise 0 of prism 1 must be above 0 and finite"),
+        (lambda: RobustMisfit(DATA, torch.tensor([0.1, 0.0])), "the noise 0 of prism 2 must be above 0 and finite"),
         (lambda: RobustMisfit(DATA, torch.ones(3)), r"the noise has shape \(3,\), the data have 2 prisms"),
-        (lambda: RobustMisfit(DATA[..., :2]), "the noise of prism 0 can't be measured: no 3 × 3 pixels count together"),
+        (lambda: RobustMisfit(DATA[..., :2]), "the noise of prism 1 can't be measured: no 3 × 3 pixels count together"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(attempt, law):
@@ -397,5 +397,5 @@ def test_uniform_images_are_refused_whatever_the_mask_leaves_out(make):
     data[1, 0, 0, 0] = 3.0
     mask = torch.ones(data.shape, dtype=torch.bool)
     mask[1, 0, 0, 0] = False
-    with pytest.raises(ValueError, match=r"the images of prism 1 are uniform"):
+    with pytest.raises(ValueError, match=r"the images of prism 2 are uniform"):
         make(data, mask)

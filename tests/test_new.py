@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -190,11 +191,24 @@ def test_init_is_an_alias(tmp_path, recording):
 
 def test_several_files_are_joined_beside_the_configuration(tmp_path, recording):
     folder = written(recording, tmp_path, "folder")
-    assert new(*folder.glob("*.tif"), "--out", tmp_path / "runs" / "run.toml", "--pixel-size", 0.15) == 0
+    assert new(*sorted(folder.glob("*.tif")), "--out", tmp_path / "runs" / "run.toml", "--pixel-size", 0.15) == 0
     joined = read_stack(tmp_path / "runs" / "run.stack.ome.tif")
     assert np.array_equal(joined.data, recording.data)
     assert joined.pixel_size == (0.15, 0.15)
     assert 'path = "run.stack.ome.tif"' in (tmp_path / "runs" / "run.toml").read_text()
+
+
+def test_which_file_is_which_setting_is_said(tmp_path, recording, capsys):
+    for name, images in zip(("b_plus.tif", "a_minus.tif"), recording.data, strict=True):
+        write_stack(tmp_path / name, images, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "b_plus.tif", tmp_path / "a_minus.tif", "--out", tmp_path / "run.toml") == 0
+    said, text = capsys.readouterr().out, (tmp_path / "run.toml").read_text()
+    assert re.search(r"setting 1 +b_plus\.tif .*\n +setting 2 +a_minus\.tif ", said)
+    assert "# setting 1, b_plus.tif: length" in text
+    assert "# setting 2, a_minus.tif: length" in text
+    joined = read_stack(tmp_path / "run.stack.ome.tif")
+    assert np.array_equal(joined.data, recording.data)
+    assert joined.names == ("b_plus.tif", "a_minus.tif")
 
 
 def test_one_plane_has_one_slice(tmp_path):
@@ -244,6 +258,9 @@ REFUSALS = {
         "640",
     ): "--z-step: 640 µm is no distance between focus planes (0.001 to 100 µm); lengths are in",
     ("--shear-angle", "10", "20", "30"): "--shear-angle 10 20 30: 3 angles, and the images show one axis of shear in 2",
+    ("--shear-angle", "999"): "--shear-angle: 999° is no angle of at most a turn",
+    ("--bias", "400"): "--bias: 400° is no angle of at most a turn",
+    ("--bias", "65", "-65", "65"): "--bias 65 -65 65: 3 biases for 2 prism settings: give one, or one for each",
     ("--wavelength", "546"): "546 µm is no wavelength of light (0.01 to 20 µm); lengths are in µm: 546 nm are 0.546 µm",
     ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",
     ("--shear", "180"): "--shear: 180 µm is no shear",
@@ -251,8 +268,9 @@ REFUSALS = {
     ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
     ("--background", "0.9"): "--background 0.9 must be at least 1",
     ("--background", "13.6"): "--background: 13.6 is no refractive index of a transparent medium (at most 6); is the",
-    ("--offset", "-1"): "--offset -1 must be at least 0, and finite",
-    ("--bias", "nan"): "--bias nan must be",
+    ("--offset", "-1"): "--offset -1 must be at least 0:",
+    ("--offset", "2000"): "--offset 2000 must be below the images' background, which is",
+    ("--bias", "nan"): "--bias nan must be finite",
     ("--out", "run.txt"): "must end in .toml",
 }
 
@@ -467,6 +485,110 @@ def test_an_axis_whose_angle_is_not_given_is_remarked():
     assert "first axis alone" not in said
     assert said.count("310° is given: reversed") == 1
     assert "45° is given" not in said
+
+
+def test_as_many_angles_as_divide_the_settings_are_taken_in_order_and_remarked():
+    """Of two axes the images show one where the first's edges are crowded, or its specimen round."""
+    seen = [setting(41), setting(219), setting(38), setting(222)]
+    gathered, found, settled = settled_of(seen, shear_angle=(119.0, 209.0))
+    expected = [(119, 90), (119, -90), (209, 90), (209, -90)]
+    assert [(angle.value, bias.value) for _, angle, bias in settled.prisms] == expected
+    said = "\n".join(warnings_of(gathered, found, settled))
+    assert "the images show one axis of shear, 2 angles are given: 119° to settings 1 and 2, 209° to settings 3" in said
+    *_, settled = settled_of(TWO_AXES, shear_angle=(45.0, 135.0))  # where they show as many, nothing is to be said
+    assert not settled.remarks
+
+
+def test_signs_of_biases_that_the_images_show_are_not_called_given():
+    *_, settled = settled_of(TWO_AXES, bias=(65.0,))
+    found = [(bias.value, bias.origin) for *_, bias in settled.prisms]
+    assert found == [(65, "given"), (-65, "measured"), (65, "given"), (-65, "measured")]
+    *_, settled = settled_of(TWO_AXES, bias=(-65.0, 65.0, 0.0, 65.0))
+    found = [(angle.value, bias.value, bias.origin) for _, angle, bias in settled.prisms]
+    # shear and bias reversed together give the same images
+    angles = [pytest.approx(220, abs=1.5)] * 2 + [pytest.approx(310, abs=1.5)] * 2
+    assert found == list(zip(angles, (-65, 65, 0, 65), ("given",) * 4, strict=True))
+
+
+def test_a_bias_that_is_given_is_kept_where_the_field_is_dark():
+    seen = [setting(40), setting(None, level=30.0), setting(220)]
+    gathered, found, settled = settled_of(seen, bias=(65.0,))
+    assert [bias.value for *_, bias in settled.prisms] == [65, 65, -65]
+    said = "\n".join(warnings_of(gathered, found, settled))
+    assert "setting 2's empty field is dark beside another's, as with bias 0; --bias 65 is kept" in said
+    assert "--bias 65 0 -65" in said
+
+
+@pytest.mark.parametrize("settings", [1, 2])
+@pytest.mark.parametrize("left", [0.0, 0.05, -0.3])
+def test_a_subtracted_background_is_one_line_and_may_be_put_back(tmp_path, recording, capsys, settings, left):
+    data = recording.data[:settings].astype(np.float32)
+    level = float(np.median(data))
+    write_stack(tmp_path / "sub.tif", data - (1 - left) * level, (0.15, 0.15), 0.4)
+    words = (tmp_path / "sub.tif", "--out", tmp_path / "run.toml", "--bias", 80)
+    assert new(*words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "background is" in line
+    assert "the background has been subtracted; the model needs the raw counts, or what was subtracted put back" in line
+    assert not (tmp_path / "run.toml").exists()
+    assert new(*words, "--offset", -(1 - left) * level) == 0
+    config = load(tmp_path / "run.toml")
+    assert config.data is not None
+    assert config.data.offset == pytest.approx(-(1 - left) * level)
+    angle = math.degrees(math.atan2(*map(float, config.acquisition.prisms[0].shear)))
+    assert abs((angle - 40 + 180) % 360 - 180) < 5
+
+
+def brightened(recording, share):
+    """The recording with a share of its pixels at the camera's full scale, row by row."""
+    data = recording.data.copy()
+    data[:, :, : round(share * data.shape[2])] = 4095
+    return data
+
+
+def test_saturated_pixels_are_counted_and_most_of_them_refused(tmp_path, recording, capsys):
+    """Regions that are always saturated are no hot pixels of the camera."""
+    write_stack(tmp_path / "s.tif", brightened(recording, 0.25), (0.15, 0.15), 0.4, bits=12)
+    assert new(tmp_path / "s.tif", "--out", tmp_path / "run.toml") == 0
+    said = capsys.readouterr().out
+    assert f"{10 * 44 * 10}  " in said.partition("hot, dead, saturated pixels")[2]
+    assert "warning: 25.0% of the pixels are saturated" in said
+    write_stack(tmp_path / "most.tif", brightened(recording, 0.6), (0.15, 0.15), 0.4, bits=12)
+    assert new(tmp_path / "most.tif", "--out", tmp_path / "most.toml") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "60.0% of setting 1's pixels are saturated, at 4095: their intensity is unknown, and at most 50% may" in line
+
+
+def test_a_setting_of_one_value_is_refused(tmp_path, recording, capsys):
+    data = recording.data.copy()
+    data[1] = 300
+    write_stack(tmp_path / "s.tif", data, (0.15, 0.15), 0.4)
+    assert new(tmp_path / "s.tif", "--out", tmp_path / "run.toml") == 2
+    assert "all pixels of setting 2 are 300: nothing is recorded in them" in capsys.readouterr().err
+
+
+def test_images_that_show_nothing_are_warned_of_in_one_line(tmp_path, capsys):
+    noise = np.random.default_rng(1).normal(500, 23, (2, 5, 48, 48)).astype(np.uint16)
+    said = {}
+    for name, data in (("noise", noise), ("small", noise[..., :7, :9])):
+        write_stack(tmp_path / f"{name}.tif", data, (0.15, 0.15), 0.4)
+        assert new(tmp_path / f"{name}.tif", "--out", tmp_path / f"{name}.toml") == 0
+        said[name] = capsys.readouterr().out
+        assert re.search("sharpest plane +not seen", said[name])
+        assert "the sharpest is" not in (tmp_path / f"{name}.toml").read_text()
+    assert said["noise"].count("warning:") == said["small"].count("warning:") == 1
+    assert (
+        "warning: the images show no shear's direction, as of an empty field, of noise or of too faint" in said["noise"]
+    )
+    assert "warning: images of 7 × 9 pixels are too small to tell background, noise and shear" in said["small"]
+
+
+def test_a_bias_of_0_on_a_bright_background_is_warned_of(tmp_path, recording, capsys):
+    words = (written(recording, tmp_path), "--out", tmp_path / "run.toml", "--bias", 0)
+    assert new(*words) == 0
+    said = capsys.readouterr().out
+    assert "warning: --bias 0 makes an empty field dark, but setting 1's background is" in said
+    assert "warning: --bias 0 makes an empty field dark, but setting 2's background is" in said
 
 
 def test_the_angle_is_as_uncertain_as_its_settings_are_apart():

@@ -166,5 +166,5 @@ def test_a_users_mask_adds_to_the_saturated_pixels():
 def test_masks_that_leave_nothing_or_do_not_fit_are_refused():
     with pytest.raises(StackError, match=r"the mask has shape \(6, 5\), the data \(2, 3, 5, 6\)"):
         counted_pixels(stack(), np.ones((6, 5), bool))
-    with pytest.raises(StackError, match="no pixel of prism 0 counts: all are saturated or masked"):
+    with pytest.raises(StackError, match="no pixel of prism 1 counts: all are saturated or masked"):
         counted_pixels(stack(), np.arange(2).reshape(2, 1, 1, 1) > 0)

@@ -108,6 +108,14 @@ def test_what_microscopists_use_is_neither_refused_nor_warned_of(changes):
             "microscope.camera.pixel_size: 6.5 µm in the specimen is",
         ),
         ({"acquisition__prisms": [{"shear": [0.0, 2.4], "bias": 1.5}] * 2}, "acquisition.prisms[0].shear: 2.4 µm"),
+        (
+            {"volume__spacing": [27.4, 0.16, 0.16]},
+            "volume.slice_thickness (or spacing): 27.4 µm is likely wrong: the planes of focus span 6 µm",
+        ),
+        (
+            {"acquisition__prisms": [{"shear": [0.0, 0.2], "bias": 1.5}, {"shear": [0.0, 0.0], "bias": 1.5}]},
+            "acquisition.prisms[1].shear: 0 is likely wrong among others of 0.2 µm",
+        ),
         ({"reconstruction__bounds": {"lower": 0.0, "upper": 4.8}}, "reconstruction.bounds.upper: 4.8 is likely wrong"),
         ({"calibration__bead": {"radius": 1.0, "index": 2.59}}, "calibration.bead.index: 2.59 is likely wrong"),
     ],

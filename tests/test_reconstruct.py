@@ -141,13 +141,17 @@ def test_the_simulated_stack_is_the_models_images(workplace):
     assert np.array_equal(read_stack(workplace / "simulated" / "stack.ome.tif").data, expected.numpy())
 
 
-@pytest.mark.parametrize("focus", [[0.5], [1.0, 0.0, -1.0], [0.0, 0.5, 2.0]])
-def test_a_focus_step_is_written_only_where_there_is_one(other, tmp_path, focus):
+@pytest.mark.parametrize(
+    ("focus", "step"),
+    [([0.5], None), ([0.88, 0.44, 0.0, -0.44], 0.44), ([0.0, 0.5, 2.0], None), ([0.1, 0.2, 0.3], 0.1)],
+)
+def test_a_focus_step_is_written_only_where_there_is_one(other, tmp_path, focus, step):
+    """Its size, also where the planes run backwards, without the rounding of a difference."""
     path = other({"acquisition": {"focus": focus}})
     assert command("simulate", path, "--out", tmp_path / "out")[0] == 0
     stack = read_stack(tmp_path / "out" / "stack.ome.tif")
     assert stack.data.shape[1] == len(focus)
-    assert stack.focus_step is None
+    assert stack.focus_step == step
 
 
 def test_the_same_seed_gives_the_same_noise_and_another_one_another(other, tmp_path):

@@ -42,7 +42,7 @@ def _write_ome(recording: Recording, data: np.ndarray, path: Path, immersion: fl
         "SignificantBits": recording.camera.bits,
         **{f"PhysicalSize{axis}": float(recording.field.spacing[1]) for axis in "XY"},
         "Channel": {
-            "Name": [f"setting {number}" for number in range(channels)],
+            "Name": [f"setting {number + 1}" for number in range(channels)],
             "EmissionWavelength": [wavelength] * channels,
             "EmissionWavelengthUnit": ["nm"] * channels,
         },

@@ -38,6 +38,18 @@ class Line:
     comment: str = ""
 
 
+def chosen(given: float | None, said: float | None, guess: float, name: str, why: str) -> Sourced:
+    """What the user gave, else what a file says, else a guess.
+
+    name: in plain words, of the quantity. why: the guess, in some words.
+    """
+    if given is not None:
+        return Sourced(float(given), "given", name=name)
+    if said is not None:
+        return Sourced(float(f"{said:.6g}"), "file", name=name)
+    return Sourced(guess, "assumed", why, name)
+
+
 def commented(head: Sequence[str], top: Sequence[Line], tables: Mapping[str, Sequence[Line]]) -> str:
     """A TOML text.
 

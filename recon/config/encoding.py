@@ -14,8 +14,8 @@ _MARKS = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 
-# A number with a decimal comma, in no array.
-_COMMA = re.compile(r"^[^#\[\n]*=\s*([+-]?\d+,\d+)\s*[#}\n]", re.MULTILINE)
+# A number with a decimal comma, in no array: the next key of a table may follow it.
+_COMMA = re.compile(r"^[^#\n]*=\s*([+-]?\d+,\d+)\s*[,#}\n]", re.MULTILINE)
 
 
 def decoded(content: bytes) -> str:

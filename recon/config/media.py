@@ -1,4 +1,4 @@
-"""Media and glasses between specimen and objective by their names."""
+"""Media and glasses around a specimen, and between it and the objective, by their names."""
 
 from typing import Any
 

@@ -54,6 +54,9 @@ def canonical(values: Mapping[str, Any]) -> Table:
     spellings of one value are given or one of them lacks a part, and TypeError where a part is no number.
     """
     known = dict(values)
+    for table in ("volume", "specimen"):
+        if isinstance(known.get(table), dict) and isinstance(known[table].get("background"), str):
+            known[table] = {**known[table], "background": index_of(known[table]["background"], f"{table}.background")}
     if isinstance(known.get("volume"), dict):
         known["volume"] = _volume(known["volume"])
     known = _with_layer(known)

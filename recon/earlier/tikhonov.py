@@ -157,8 +157,8 @@ def _weighted_transfer(setup: Setup, fidelity: Fidelity, scale: Tensor) -> Compl
             prism = acquisition.prisms[i]
             which = "bright field" if prism is None else f"bias {number(prism.bias):g}"
             raise ValueError(
-                f"prism {i} ({which}) has no linear response: its images don't change to first order in Δn, as without "
-                "bias; leave them out"
+                f"prism {i + 1} ({which}) has no linear response: its images don't change to first order in Δn, as "
+                "without bias; leave them out"
             )
     transfer.mul_(scale[..., None])
     return transfer[..., : grid.shape[2] // 2 + 1].flatten(0, 1)

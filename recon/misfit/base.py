@@ -28,7 +28,9 @@ def spatial_variance(
     rounding = (4 * torch.finfo(data.dtype).eps * data.abs().amax((1, 2, 3))).square()
     for prism, (value, least) in enumerate(zip(variance.tolist(), rounding.tolist(), strict=True)):
         if not value > least:
-            raise ValueError(f"the images of prism {prism} are uniform (variance {value:g}): there is nothing to fit")
+            raise ValueError(
+                f"the images of prism {prism + 1} are uniform (variance {value:g}): there is nothing to fit"
+            )
     return variance
 
 
@@ -118,5 +120,5 @@ def _fitted(mask: Tensor, data: Tensor) -> Bool[Tensor, "prism focus y x"] | Non
         raise ValueError(f"the mask has shape {tuple(mask.shape)}, the data {tuple(data.shape)}") from error
     for prism, number in enumerate(mask.sum((1, 2, 3)).tolist()):
         if number == 0:
-            raise ValueError(f"the mask leaves no pixel of prism {prism}: there is nothing to fit")
+            raise ValueError(f"the mask leaves no pixel of prism {prism + 1}: there is nothing to fit")
     return None if bool(mask.all()) else mask

@@ -38,7 +38,7 @@ class RobustMisfit(Misfit):
             raise ValueError(f"the noise has shape {tuple(noise.shape)}, the data have {len(self.data)} prisms")
         for prism, value in enumerate(noise.tolist()):
             if not 0 < value < math.inf:
-                raise ValueError(f"the noise {value:g} of prism {prism} must be above 0 and finite")
+                raise ValueError(f"the noise {value:g} of prism {prism + 1} must be above 0 and finite")
         self.noise = noise
         self._set_scale(noise)
 
@@ -59,7 +59,7 @@ class RobustMisfit(Misfit):
         scale = torch.stack([prism.nanmedian() for prism in residual]) / NORMAL_MAD
         for prism, value in enumerate(scale.tolist()):
             if not value > 0:
-                raise ValueError(f"the residual's median in prism {prism} is {value:g}: it gives no scale")
+                raise ValueError(f"the residual's median in prism {prism + 1} is {value:g}: it gives no scale")
         other = copy.copy(self)
         other._set_scale(scale)
         return other
@@ -116,5 +116,7 @@ def _measured(data: Tensor, mask: Tensor | None) -> Tensor:
     levels = [noise_level(prism) for prism in known.cpu().numpy()]
     for prism, level in enumerate(levels):
         if level is None:
-            raise ValueError(f"the noise of prism {prism} can't be measured: no 3 × 3 pixels count together; give it")
+            raise ValueError(
+                f"the noise of prism {prism + 1} can't be measured: no 3 × 3 pixels count together; give it"
+            )
     return data.new_tensor(levels)

@@ -88,7 +88,7 @@ def empty_field(stack: Stack, of: Stack, offset: float = 0.0, ratio: float | Non
         level = float(np.median(image))
         if level <= 0:
             raise StackError(
-                f"{stack.source}: the empty field of prism {prism} minus the offset {offset:g} is {level:.4g}: "
+                f"{stack.source}: the empty field of prism {prism + 1} minus the offset {offset:g} is {level:.4g}: "
                 "it must be above 0, in the unit of the stack"
             )
         bad |= image < _DARK * level

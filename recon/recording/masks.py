@@ -9,6 +9,9 @@ from scipy import ndimage
 from torchdic.errors import StackError
 from torchdic.files.format import Stack
 
+# The largest part of a setting's pixels that may be saturated or stuck: of more nothing could be said by the others.
+MOST_SATURATED = 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
@@ -47,13 +50,21 @@ def left_out(
     """The pixels of a stack that a fit leaves out: by a user's mask, because they are saturated, and the stuck ones.
 
     mask: True where a pixel counts, as of `counted_pixels`. stuck: True where a pixel of the camera is, see
-    `recon.recording.stuck_pixels`. Raises StackError as `counted_pixels` does.
+    `recon.recording.stuck_pixels`. Raises StackError as `counted_pixels` does, and where more than half of a prism's
+    pixels are saturated or stuck among those that the mask leaves: the others would be explained by nearly any volume.
     """
     counted = counted_pixels(stack, mask, stuck)
     if counted is None:
         return LeftOut()
     wanted = np.ones(counted.shape, bool) if mask is None else np.broadcast_to(mask, counted.shape)
     sound = wanted if stuck is None else wanted & ~stuck
+    for prism, (kept, images) in enumerate(zip(wanted, counted, strict=True), start=1):
+        lost = int((kept & ~images).sum())
+        if lost > MOST_SATURATED * kept.sum():
+            raise StackError(
+                f"{stack.source}: {lost / kept.sum():.1%} of prism {prism}'s pixels are saturated or stuck: at most "
+                f"{MOST_SATURATED:.0%} may be left out so; the others say too little of a volume"
+            )
     number = 0 if stuck is None else int(stuck.sum())
     return LeftOut(
         counted,
@@ -84,7 +95,7 @@ def counted_pixels(
         counted = counted & ~stuck
     for prism, images in enumerate(counted):
         if not images.any():
-            raise StackError(f"{stack.source}: no pixel of prism {prism} counts: all are saturated or masked")
+            raise StackError(f"{stack.source}: no pixel of prism {prism + 1} counts: all are saturated or masked")
     return None if counted.all() else counted
 
 

@@ -197,7 +197,7 @@ def _in_model_unit(
 
     counted: the pixels that count; None is all. by: the empty field by which they are divided, if any.
     """
-    images, label, (bias, expected) = stack.data[prism], f"{stack.source}: prism {prism}", empty
+    images, label, (bias, expected) = stack.data[prism], f"{stack.source}: prism {prism + 1}", empty
     known = images if counted is None else np.where(counted[prism], images, np.nan)
     flatten, scale, offset = normalisation.flattens(stack), normalisation.scale_of(stack), normalisation.offset
     is_extinct = expected < _EXTINCT
@@ -246,8 +246,8 @@ def _scaled_as(scales: Sequence[float], stack: Stack, prism: int, normalisation:
         return normalisation
     scale = float(np.median(scales))
     warnings.warn(
-        f"{stack.source}: prism {prism}'s empty field is dark and tells no scale: it is scaled as the other prisms, "
-        f"{scale:.4g} per empty bright field, which is right for one lamp and one exposure",
+        f"{stack.source}: prism {prism + 1}'s empty field is dark and tells no scale: it is scaled as the other "
+        f"prisms, {scale:.4g} per empty bright field, which is right for one lamp and one exposure",
         StackWarning,
         stacklevel=3,
     )
@@ -402,7 +402,7 @@ def _check_brightness(stack: Stack, reports: Sequence[PrismReport], levels: Sequ
                 "data.scale = 'background' scales by it"
             )
         warnings.warn(
-            f"{stack.source}: prism {prism}'s background is {found:.4g}, not {expected:.4g} as the model's: float "
+            f"{stack.source}: prism {prism + 1}'s background is {found:.4g}, not {expected:.4g} as the model's: float "
             f"pixels count as relative to the empty bright field unless a scale is given; {advice}",
             StackWarning,
             stacklevel=3,

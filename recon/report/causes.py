@@ -157,10 +157,10 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
     total = max(float((prisms - noise).sum()), 1e-12)
     if len(prisms) > 1 and float(prisms[worst]) > PRISM * max(least, noise):
         yield Cause(
-            f"prism {worst}",
+            f"prism {worst + 1}",
             min(1.0, float(prisms[worst] - noise) / total) / 2,
             f"its residual is {float(prisms[worst]) / max(least, 1e-12):.1f} times that of the best prism",
-            f"check shear, bias and files of prism {worst} (counted from 0), or fit it (learn = ['bias'])",
+            f"check shear, bias and files of prism {worst + 1} (counted from 1), or fit it (learn = ['bias'])",
         )
     median = float(power.median())
     p, f = divmod(int(power.argmax()), power.shape[1])
@@ -168,7 +168,8 @@ def _uneven(power: Float[Tensor, "prism focus"], noise: float) -> Iterator[Cause
         yield Cause(
             "one image",
             min(1.0, float(power[p, f] - noise) / max(float((power - noise).sum()), 1e-12)),
-            f"prism {p}, plane {f} leaves {float(power[p, f]) / max(median, 1e-12):.1f} times the median image's",
+            f"prism {p + 1}, plane {f + 1} (counted from 1) leaves "
+            f"{float(power[p, f]) / max(median, 1e-12):.1f} times the median image's",
             "look at that image (moved, blurred, in the wrong place?) and mask it or leave it out",
         )
 

@@ -180,7 +180,7 @@ def _write_images(
     measured: Measured,
 ) -> None:
     """Write the measured images beside the model's, two channels for each prism. Raises StackError."""
-    names = [f"{kind}, prism {prism}" for prism in range(len(data)) for kind in ("measured", "modelled")]
+    names = [f"{kind}, prism {prism}" for prism in range(1, len(data) + 1) for kind in ("measured", "modelled")]
     pairs = torch.stack([data, images], 1).flatten(0, 1)
     write_stack(path, pairs, measured.pixel_size, equal_step(measured.focus), names=names)
 

@@ -18,6 +18,9 @@ from torchdic.files.stack import FORMATS, format_of, read_stack
 # Micro-Manager's file beside the planes of a folder.
 _METADATA = "metadata.txt"
 
+# As many files are named one by one.
+_FEW = 3
+
 # What a file's name is made of: numbers and words.
 _PART = r"\d+|[^\W\d_]+"
 
@@ -30,7 +33,8 @@ _OF_PRISMS = ("c", "ch", "channel", "w", "setting", "prism", "bias", "shear", "f
 class Gathered:
     """A stack, the files that it comes from, and what they say of the microscope.
 
-    stack: its source names the one file, or the folder and the number of files.
+    stack: its source names the one file, or a few, or the folder and the number of files; its names say which files
+        each prism setting is of, where several files are.
     files: in the order in which they were read. setup: what they say; sizes that the stack has are not repeated.
     """
 
@@ -45,14 +49,15 @@ class Gathered:
 
 
 def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
-    """The stack in one file, in several, or in a folder of them, in the natural order of their names.
+    """The stack in one file, in several, or in a folder of them.
 
+    paths: prism settings are in this order; those of a folder in the natural order of the files' names.
     series: as for `read_stack`; of each file.
 
     Files of one plane each are the planes, in the order of the one number in their names that changes. Where two do,
     such as c1 and z03, or a word does, one counts the prism settings. Files of several planes are a prism setting each.
-    Raises StackError for no file, a folder without images, files of different shapes or dtypes, and names from which no
-    order follows, and as `read_stack` does.
+    Raises StackError for no file, one that is named twice, a folder without images, files of different shapes or
+    dtypes, and names from which no order follows, and as `read_stack` does.
     """
     files, folder = _listed(paths)
     stacks = [read_stack(file, series) for file in files]
@@ -62,16 +67,19 @@ def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
         said = said.completed(setup_in_words(beside.read_text(encoding="utf-8", errors="replace")))
     if len(stacks) == 1:
         return Gathered(_with_sizes(stacks[0], said), files, said)
-    source = f"{len(files)} files in {folder or files[0].parent}"
     check_alike(stacks, settings=True)
     if stacks[0].data.shape[:2] == (1, 1):
-        prisms, planes = _layout(files)
+        prisms, planes = _layout(files, typed=folder is None)
         order = np.array(sorted(range(len(files)), key=lambda i: (prisms[i], planes[i])))
         data = np.stack([stacks[i].data[0, 0] for i in order])
         data = data.reshape(len(set(prisms)), -1, *data.shape[1:])
+        names = [_span([files[i] for i in part]) for part in np.split(order, len(data))]
     else:
         order, data = np.arange(len(files)), np.concatenate([stack.data for stack in stacks])
-    joined = replace(stacks[0], data=data, names=(), source=source)
+        names = [
+            name for file, stack in zip(files, stacks, strict=True) for name in _settings_of(file, len(stack.data))
+        ]
+    joined = replace(stacks[0], data=data, names=tuple(names), source=_source(files, folder))
     return Gathered(_with_sizes(joined, said), tuple(files[i] for i in order), said)
 
 
@@ -80,13 +88,34 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part]
 
 
+def _source(files: Sequence[Path], folder: Path | None) -> str:
+    """The files in words: a few by their names."""
+    if folder is None and len(files) <= _FEW:
+        return ", ".join(map(str, files[:-1])) + f" and {files[-1]}"
+    return f"{len(files)} files in {(folder or files[0].parent).resolve()}"
+
+
+def _span(files: Sequence[Path]) -> str:
+    return files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
+
+
+def _settings_of(file: Path, number: int) -> list[str]:
+    """The names of a file's prism settings, counted from 1 where it holds several."""
+    return [file.name] if number == 1 else [f"{file.name}, its setting {i + 1}" for i in range(number)]
+
+
 def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
-    """The files in natural order, and the folder if one was named."""
+    """The files as typed, or those of a folder in natural order, and the folder if one was named."""
     if not paths:
         raise StackError("no stack is named: give a file, several, or a folder of planes")
     folders = [path for path in paths if path.is_dir()]
     if not folders:
-        return tuple(sorted(paths, key=lambda path: natural(path.name))), None
+        known: dict[Path, Path] = {}
+        for path in paths:
+            if path.resolve() in known:
+                raise StackError(f"{path}: is named twice; each file is a prism setting, or a plane, of its own")
+            known[path.resolve()] = path
+        return tuple(paths), None
     if len(paths) > 1:
         raise StackError(f"{folders[0]}: is a folder; give one folder, or files")
     suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
@@ -122,13 +151,18 @@ def _with_sizes(stack: Stack, said: StatedSetup) -> Stack:
     )
 
 
-def _layout(files: Sequence[Path]) -> tuple[list[int], list[int]]:
-    """Which prism setting and which plane each file is, by what changes in their names."""
+def _layout(files: Sequence[Path], *, typed: bool) -> tuple[list[int], list[int]]:
+    """Which prism setting and which plane each file is, by what changes in their names.
+
+    typed: whether the settings are in the order of the files, not in the natural order of their names.
+    """
     parts = [_parts(file) for file in files]
     if len({tuple(part.isdigit() for part in name) for name in parts}) > 1:
         raise StackError(f"{files[0].parent}: the names differ in more than numbers and words: {_two(files)}")
     changing = [i for i in range(len(parts[0])) if len({name[i] for name in parts}) > 1]
     prism = next((i for i in changing if _counts(parts[0], i, _OF_PRISMS)), None)
+    if prism is None and len(changing) == 1 and not parts[0][changing[0]].isdigit():
+        prism = changing[0]  # a word alone, such as plus and minus
     if prism is None and len(changing) == 2:
         words = [i for i in changing if not parts[0][i].isdigit()]
         of_planes = [i for i in changing if _counts(parts[0], i, _OF_PLANES)]
@@ -142,7 +176,8 @@ def _layout(files: Sequence[Path]) -> tuple[list[int], list[int]]:
     of_prisms, of_planes = (
         [natural(name[i[0]]) if i else [] for name in parts] for i in ([] if prism is None else [prism], planes)
     )
-    settings, depths = sorted(map(tuple, {tuple(v) for v in of_prisms})), sorted({tuple(v) for v in of_planes})
+    settings, depths = list(dict.fromkeys(tuple(v) for v in of_prisms)), sorted({tuple(v) for v in of_planes})
+    settings = settings if typed else sorted(settings)
     places = [(settings.index(tuple(v)), depths.index(tuple(d))) for v, d in zip(of_prisms, of_planes, strict=True)]
     if len(settings) * len(depths) != len(files):
         raise StackError(

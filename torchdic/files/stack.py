@@ -70,11 +70,11 @@ def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack
 
 
 def equal_step(focus: Sequence[float]) -> float | None:
-    """The distance in µm between focus planes; None unless they rise in equal steps."""
+    """The distance in µm between focus planes, above 0; None unless they rise, or fall, in equal steps."""
     steps = [b - a for a, b in pairwise(focus)]
-    if not steps or steps[0] <= 0 or max(steps) - min(steps) > 1e-6 * steps[0]:
+    if not steps or not steps[0] or max(steps) - min(steps) > 1e-6 * abs(steps[0]):
         return None
-    return steps[0]
+    return float(f"{abs(steps[0]):.10g}")  # differences of tenths are tenths again
 
 
 def write_stack(

@@ -8,6 +8,7 @@ from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
 from recon.cli.own_stack.template import template
+from recon.cli.own_stack.unusable import check_background, check_recorded, put_back
 from recon.config.including import seen_from
 from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
@@ -61,15 +62,21 @@ def run(options: argparse.Namespace) -> None:
 
 
 def look(gathered: Gathered, given: Given) -> tuple[Survey, Settled]:
-    """What the images tell, and the values of a configuration."""
+    """What the images tell, and the values of a configuration.
+
+    Raises StackError or ConfigError where the images can't be compared with a model's, see `unusable`.
+    """
     said, pixel = gathered.setup, gathered.stack.pixel_size
     microscope = Microscope(
         given.get("wavelength") or said.wavelength or WAVELENGTH, Objective(given.get("na") or said.na or NA)
     )
+    check_recorded(gathered.stack)
+    stack = put_back(gathered.stack, given.get("offset"))
     background, side = given.get("background") or BACKGROUND, given.get("pixel_size")
     # without a pixel size the smallest ratio that `sharpest` knows finds the most stuck pixels
     size = (side, side) if side else pixel or (SMALL, SMALL)
-    found = survey(gathered.stack, sharpest(microscope, size, background))
+    found = survey(stack, sharpest(microscope, size, background))
+    check_background(stack, found, given.get("offset"))
     return found, settle(gathered, found, given)
 
 
@@ -83,4 +90,5 @@ def _join(gathered: Gathered, settled: Settled, path: Path) -> None:
         None if settled.pixel_size.origin == "assumed" else (pixel, pixel),
         settled.step.value if known else None,
         bits=stack.bits,
+        names=stack.names,
     )

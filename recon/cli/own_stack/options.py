@@ -26,12 +26,15 @@ OPTIONS = {
         "direction of the shear in degrees, from right towards down; where the settings have several axes, one for "
         "each in their order, or one for each setting: --shear-angle 45 135; a single one is of the first axis"
     ),
-    "bias": "phase between the beams in degrees",
-    "offset": "counts of a dark image",
+    "bias": (
+        "phase between the beams in degrees: one for all settings, whose signs the images show, or one for each "
+        "setting: --bias 65 -65"
+    ),
+    "offset": "counts of a dark image; below 0 what was subtracted from the images, which is put back",
 }
 
 # Options that take several numbers, and those that are angles in degrees.
-SEVERAL, _ANGLES = ("--shear-angle",), ("bias", "shear_angle")
+SEVERAL, _ANGLES = ("--shear-angle", "--bias"), ("bias", "shear_angle")
 
 # Where a value is held whose size is checked there.
 _AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
@@ -40,10 +43,12 @@ _AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
     "pixel_size": lambda value: {"volume": {"pixel_size": value}},
     "z_step": lambda value: {"z_step": value},
     "shear": lambda value: {"acquisition": {"prisms": [{"shear": {"length": value}}]}},
+    "shear_angle": lambda value: {"acquisition": {"prisms": [{"shear": {"angle_degrees": value}}]}},
+    "bias": lambda value: {"acquisition": {"prisms": [{"bias_degrees": value}]}},
 }
 
 # The least values of options that need not be above 0.
-_LEAST = {"background": 1.0, "offset": 0.0}
+_LEAST = {"background": 1.0} | dict.fromkeys(("offset", *_ANGLES), -math.inf)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -64,12 +69,12 @@ def given_of(options: argparse.Namespace) -> Given:
 
 def _check(name: str, value: float) -> None:
     option = f"--{name.replace('_', '-')}"
-    if math.isfinite(value) and name in _ANGLES:
-        return
+    if not math.isfinite(value):
+        raise ConfigError(f"{option} {value:g} must be finite")
     least = _LEAST.get(name)
-    if not ((value > 0 if least is None else value >= least) and value < math.inf):
+    if value <= 0 if least is None else value < least:
         lowest = "above 0" if least is None else f"at least {least:g}"
-        raise ConfigError(f"{option} {value:g} must be {lowest}, and finite")
+        raise ConfigError(f"{option} {value:g} must be {lowest}")
     wrong = impossible(_AS_KEYS[name](value)) if name in _AS_KEYS else None
     if wrong is not None:
         raise ConfigError(f"{option}: {wrong.partition(': ')[2]}")

@@ -4,16 +4,24 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from recon.cli.own_stack.settled import Settled
-from recon.cli.own_stack.template import angle_in_words
+from recon.cli.own_stack.template import angle_in_words, name_of_setting
 from recon.config.commented import Sourced
-from recon.recording.survey.survey import Survey
+from recon.recording.survey.survey import Survey, shows_edges
 from torchdic.files.gathered import Gathered
 
 Row = tuple[str, str, str]
 
 # Uneven light by more than this part of its mean, and planes whose brightness differs by more, are worth a word.
 _UNEVEN, _FLICKER = 0.3, 0.02
+
+# Pixels along a side of the smallest images that tell anything.
+_SMALLEST = 16
+
+# The background at bias 0 is below this part of the brightest edges.
+_DARK_FIELD = 0.25
 
 # A part of the pixels of all images that is saturated.
 _SATURATED = 1e-3
@@ -26,7 +34,7 @@ def summary(path: Path, gathered: Gathered, found: Survey, settled: Settled) -> 
         f"{path}, for {gathered.stack.source}: {_counted(settings, 'prism setting')} × {_counted(planes, 'plane')} × "
         f"{height} × {width} pixels"
     )
-    rows = [*_said(gathered, settled), *_measured(gathered, found, settled)]
+    rows = [*_named(gathered), *_said(gathered, settled), *_measured(gathered, found, settled)]
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
     lines = [f"  {what:<{widths[0]}}  {value:<{widths[1]}}  {origin}" for what, value, origin in rows]
     return "\n".join([head, "", *lines])
@@ -35,6 +43,14 @@ def summary(path: Path, gathered: Gathered, found: Survey, settled: Settled) -> 
 def warnings_of(gathered: Gathered, found: Survey, settled: Settled) -> list[str]:
     """What the user should know before a reconstruction, a line each; the first is of what is assumed."""
     return list(_warned(gathered, found, settled))
+
+
+def _named(gathered: Gathered) -> Iterator[Row]:
+    """Which file, or which of a file's channels, each setting is."""
+    settings = len(gathered.stack.data)
+    for number in range(settings if settings > 1 else 0):
+        if name := name_of_setting(gathered, number):
+            yield f"setting {number + 1}", name, "file" if gathered.one_file else "in the order of the files"
 
 
 def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:
@@ -54,7 +70,8 @@ def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:
         shown = f"{length.value:g} µm, {angle.value:g}° {sure}".rstrip()
         origins = f"length {length.origin}, angle {angle.origin} (towards {angle_in_words(angle.value)})"
         yield f"shear{which}", shown, origins
-        yield f"bias{which}", f"{bias.value:g}°", bias.origin
+        inferred = bias.origin == "measured" and bias.value
+        yield f"bias{which}", f"{bias.value:g}°", "size given, sign measured" if inferred else bias.origin
 
 
 def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[Row]:
@@ -75,7 +92,8 @@ def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[R
         yield "gain", f"{found.camera.gain:.3g} counts per electron", "measured"
     if stack.data.shape[1] > 1:
         yield "planes' brightness", f"± {max(s.flicker for s in found.settings):.1%}", "measured, is fitted"
-        yield "sharpest plane", f"{found.sharpest + 1} of {stack.data.shape[1]}", "measured"
+        sharpest = f"{found.sharpest + 1} of {stack.data.shape[1]}" if shows_edges(found) else "not seen"
+        yield "sharpest plane", sharpest, "measured"
     if stack.is_integer:
         shown = f"{int(found.hot.sum())}, {int(found.dead.sum())}, {found.saturated}"
         alone = stack.data.shape[:2] == (1, 1)
@@ -93,6 +111,8 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
         yield f"warning: the file says NA {settled.na.value:g} in an immersion of {lens.immersion:g}: one is wrong"
     if settled.na.value > medium:
         yield f"NA {settled.na.value:g} is above the medium's index {medium:g}: light beyond the index is dark"
+    yield from _too_little(gathered, found)
+    yield from _bright_extinction(gathered, settled)
     uneven, flicker = (max(getattr(s, name) for s in found.settings) for name in ("unevenness", "flicker"))
     if uneven > _UNEVEN:
         yield f"warning: the light is uneven by {uneven:.0%}"
@@ -100,7 +120,36 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
         yield f"the planes' brightness differs by {flicker:.1%}; it is fitted"
     if found.saturated > _SATURATED * gathered.stack.data.size:
         yield f"warning: {found.saturated / gathered.stack.data.size:.1%} of the pixels are saturated"
+    yield from settled.remarks
     yield from _of_given_angles(found, settled)
+
+
+def _too_little(gathered: Gathered, found: Survey) -> Iterator[str]:
+    """Images that show no edges, or are too small to show them."""
+    height, width = gathered.stack.data.shape[2:]
+    if min(height, width) < _SMALLEST:
+        yield (
+            f"warning: images of {height} × {width} pixels are too small to tell background, noise and shear: of at "
+            f"least {_SMALLEST} × {_SMALLEST} they can be told"
+        )
+    elif not shows_edges(found):
+        yield (
+            "warning: the images show no shear's direction, as of an empty field, of noise or of too faint a specimen; "
+            "none of what is measured is of a specimen"
+        )
+
+
+def _bright_extinction(gathered: Gathered, settled: Settled) -> Iterator[str]:
+    """Settings whose bias is given as 0, although their background is as bright as their edges."""
+    dark = 0.0 if settled.offset is None else settled.offset.value
+    for number, (_, _, bias) in enumerate(settled.prisms):
+        images = gathered.stack.data[number]
+        background, bright = (float(value) - dark for value in np.percentile(images, (50, 99.9)))
+        if bias.origin == "given" and bias.value % 360 == 0 and background > _DARK_FIELD * bright:
+            yield (
+                f"warning: --bias {bias.value:g} makes an empty field dark, but setting {number + 1}'s background is "
+                f"{background:.3g} where its edges are {bright:.3g}: give its bias, or --offset if that is the dark"
+            )
 
 
 def _of_given_angles(found: Survey, settled: Settled) -> Iterator[str]:

@@ -4,7 +4,7 @@ import math
 
 from recon.cli.own_stack.settled import Settled
 from recon.config.commented import Line, Sourced, commented
-from recon.recording.survey.survey import Survey
+from recon.recording.survey.survey import Survey, shows_edges
 from torchdic import __version__
 from torchdic.files.gathered import Gathered
 
@@ -44,20 +44,29 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
+def name_of_setting(gathered: Gathered, number: int) -> str:
+    """The file, or the file's channel, that a setting is, counted from 0; "" where it has no name of its own."""
+    names = gathered.stack.names
+    if not names or names[number] in ("", f"setting {number + 1}"):
+        return ""
+    return f'channel "{names[number]}"' if gathered.one_file else names[number]
+
+
 def _acquisition(gathered: Gathered, found: Survey, settled: Settled) -> list[Line]:
     """Prisms and focus planes; only the user knows most of them."""
-    names = gathered.stack.names
     prisms = []
     for number, (length, angle, bias) in enumerate(settled.prisms):
         value = {"shear": {"length": length.value, "angle_degrees": angle.value}, "bias_degrees": bias.value}
-        setting = f"{names[number]}: " if names and names[number] else ""
-        words = [each.origin if number else each.comment for each in (length, bias)]
-        prisms.append(Line("", value, f"{setting}length {words[0]}; angle {angle.comment}; bias {words[1]}"))
+        name = name_of_setting(gathered, number)
+        setting = f"setting {number + 1}{f', {name}' if name else ''}"
+        words = [each.origin if number and each.origin != "measured" else each.comment for each in (length, bias)]
+        prisms.append(Line("", value, f"{setting}: length {words[0]}; angle {angle.comment}; bias {words[1]}"))
     planes = gathered.stack.data.shape[1]
-    sharpest = f"{settled.first + found.sharpest * settled.step.value:.3g}"
+    depth = f"{settled.first + found.sharpest * settled.step.value:.3g}"
+    sharpest = f"; measured: the sharpest is number {found.sharpest + 1}, at {depth}" if shows_edges(found) else ""
     comment = (
         f"step {settled.step.comment}; assumed: the first plane is where light enters, else make step and first "
-        f"change their signs; measured: the sharpest is number {found.sharpest + 1}, at {sharpest}"
+        f"change their signs{sharpest}"
     )
     focus = {"first": settled.first, "step": settled.step.value, "count": planes}
     return [

@@ -67,7 +67,7 @@ class _Plausible:
 
 
 def _with(number: float, unit: str) -> str:
-    return f"{number:g} {unit}".rstrip()
+    return f"{number:g}{unit}" if unit == "°" else f"{number:g} {unit}".rstrip()
 
 
 # The highest index of a transparent medium, with room above germanium's 4.0 and lead telluride's 5.7; the greatest

@@ -64,6 +64,8 @@ def unlikely(config: Config) -> Iterator[str]:
     yield from _differences(config)
     if config.data is not None:  # a simulation may be as fine as it likes
         yield from _sampling(config)
+        yield from _slices(config)
+        yield from _without_shear(config)
 
 
 def _light(config: Config) -> Iterator[str]:
@@ -107,6 +109,32 @@ def _differences(config: Config) -> Iterator[str]:
             f"calibration.bead.index: {bead.index:g} is likely wrong: that is Δn {contrast:+.3g} in a medium of "
             f"{config.volume.background:g}"
         )
+
+
+def _slices(config: Config) -> Iterator[str]:
+    """A slice thicker than the depth of field, and than what the planes of focus span: it lies about all of them."""
+    thickness, planes = config.volume.spacing[0], list(map(number, config.acquisition.focus))
+    span = max(planes) - min(planes)
+    if config.microscope.objective is None or config.volume.shape[0] < 2 or not span:
+        return
+    reach = config.microscope.objective.reach(config.volume.background)
+    depth = config.microscope.wavelength * config.volume.background / reach**2
+    if thickness > max(span, depth):
+        yield (
+            f"volume.slice_thickness (or spacing): {thickness:g} µm is likely wrong: the planes of focus span "
+            f"{span:g} µm, and the depth of field is {depth:.2g} µm"
+        )
+
+
+def _without_shear(config: Config) -> Iterator[str]:
+    """Prisms whose shear is 0 among others whose isn't: their images show no difference of path."""
+    lengths = [None if p is None else math.hypot(*map(number, p.shear)) for p in config.acquisition.prisms]
+    for place, length in enumerate(lengths):
+        if length == 0 and any(lengths):
+            yield (
+                f"acquisition.prisms[{place}].shear: 0 is likely wrong among others of {max(filter(None, lengths)):g} "
+                "µm: without shear an image has no DIC contrast"
+            )
 
 
 def _sampling(config: Config) -> Iterator[str]:

@@ -15,8 +15,12 @@ from recon.recording.survey.direction import ShearDirection, shear_direction, sp
 from recon.recording.survey.focus import sharpest_plane
 from torchdic.files.format import Stack
 
-# Share of the images in which a pixel is saturated that is hot.
-_ALWAYS = 0.9
+# Share of the images in which a pixel is saturated that is hot, among neighbours of which fewer than half are: too much
+# light saturates whole regions.
+_ALWAYS, _ALONE = 0.9, 0.5
+
+# Pixels along a side of the square that holds a pixel's neighbours.
+_NEIGHBOURS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +65,11 @@ class Survey:
     saturated: int
 
 
+def shows_edges(found: Survey) -> bool:
+    """Whether any setting's images show a direction of shear, as the edges of a specimen do."""
+    return any(setting.direction is not None for setting in found.settings)
+
+
 def survey(stack: Stack, ratio: float) -> Survey:
     """Look through a stack.
 
@@ -69,7 +78,7 @@ def survey(stack: Stack, ratio: float) -> Survey:
     counted = counted_pixels(stack)
     stuck = stuck_pixels(stack.data, ratio, counted)
     if counted is not None:
-        stuck = stuck | ((~counted).mean((0, 1)) > _ALWAYS)
+        stuck = stuck | _hot(~counted)
     saturated = 0 if counted is None else int((~counted & ~stuck).sum())
     counted = counted_pixels(stack, None, stuck)
     pixel = stack.pixel_size or (1.0, 1.0)
@@ -89,6 +98,12 @@ def survey(stack: Stack, ratio: float) -> Survey:
         dead=stuck & ~above,
         saturated=saturated,
     )
+
+
+def _hot(saturated: Bool[np.ndarray, "prism focus y x"]) -> Bool[np.ndarray, "y x"]:
+    """The pixels of a camera that are always saturated, and most of whose neighbours aren't."""
+    share = saturated.mean((0, 1))
+    return (share > _ALWAYS) & (ndimage.uniform_filter(share, _NEIGHBOURS, mode="nearest") < _ALONE)
 
 
 def flattened_planes(
