@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from tqdm import tqdm
+
 from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
 from recon.calibration.trials.short_fits import last_step
 from recon.fit.problem import Problem, Recipe
@@ -123,7 +125,7 @@ class _Race:
 
     def run(self, racing: Sequence[Otherwise], number: int, recipe: Recipe) -> None:
         """Fit each description as a round asks for."""
-        for other in racing:
+        for other in tqdm(racing, desc=f"signs and orders, round {number} of {len(ROUNDS)}", unit="fit"):
             last = self.fitted(other, number, recipe)
             misfit, loss = (math.inf, math.inf) if last is None else (last.misfit, last.loss)
             self.tried[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)

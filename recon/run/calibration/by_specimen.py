@@ -31,6 +31,9 @@ MODEL_APERTURE, MODEL_ANGLE = 0.05, math.radians(0.5)
 # A value within so many standard deviations of what was told agrees with it.
 AGREES = 2.0
 
+# A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
+SHOWS = 4.0
+
 SCALE = "it sets the scale of Δn: with an unknown specimen another Δn explains the images as well; use a bead"
 
 
@@ -138,11 +141,13 @@ def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuanti
             "brightness", "", None, plain(lit, 5), plain(deviations["brightness"] * lit, 2), f"{how}; always learned"
         )
     ]
-    shows = bool((drift.abs() > 3 * deviations["drift"]).any())
+    shows = bool((drift.abs() > SHOWS * deviations["drift"]).any())
     learn = config.reconstruction.learn
     if shows and "drift" not in learn:
         how += "; it shows, so that the reconstruction learns it"
         config = replace(config, reconstruction=replace(config.reconstruction, learn=(*learn, "drift")))
+    if not shows:
+        how += f"; none is {SHOWS:g} standard deviations from 0: no drift shows"
     found.append(FoundQuantity("drift", "µm", None, plain(drift, 3), plain(deviations["drift"], 2), how))
     return stack.with_config(config), found
 
