@@ -31,6 +31,9 @@ from torchdic import Fidelity
 # Steps and condenser directions of a fit.
 STEPS, SOURCES = 8, 18
 
+# The part of the priors' weight beside which brightness and drift are told.
+LIGHT = 0.25
+
 # Distance of the trials: of the shear's angle in rad, and of the logarithm of the condenser's NA.
 ANGLE, APERTURE = 0.12, 0.12
 
@@ -83,9 +86,7 @@ class Beside:
         squares = misfit.where_counted((images - misfit.data).square()) / misfit.variance
         return squares.mean((2, 3)).flatten().double().numpy()
 
-    def least(
-        self, name: str, changed: Callable[[float], Setup], step: float, limits: tuple[float, float]
-    ) -> Least:
+    def least(self, name: str, changed: Callable[[float], Setup], step: float, limits: tuple[float, float]) -> Least:
         """The change of the optics, 0 as declared, with the least misfit. name: of what is changed, for the user."""
         counted = int(self.misfit.pixels.sum())
         with tqdm(desc=name, unit="volume") as bar:
@@ -131,27 +132,25 @@ def find_aperture(beside: Beside) -> Least:
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name.
 
-    What a volume takes over of a drift, and what noise it shows instead, isn't in the deviations beside it. So images
-    with what was found, and with other noise, are fitted in the same way, and where the errors there are larger than
-    the deviations these are as much larger (a parametric bootstrap: B. Efron, Ann. Stat. 7, 1, 1979).
+    Priors draw a volume in, and a drift makes up for a part of what it lacks then. So the values are those beside a
+    volume whose priors have a part of their usual weight, and how far they moved with it is in the deviations.
     """
     with tqdm(total=2, desc="brightness and drift", unit="volume") as bar:
-        parameters, deviations, images = _images_found(beside)
+        usual, _, weight = _images_found(beside)
         bar.update()
-        again, _, _ = _images_found(replace(beside, part=replace(beside.part, data=_with_noise(images, beside))))
+        found, deviations, _ = _images_found(beside if weight is None else replace(beside, weight=LIGHT * weight))
         bar.update()
     values, sure = {}, {}
     for unknown in (Brightness(), Drift()):
         name = unknown.name
-        errors = unknown.told(again[name]) - unknown.told(parameters[name])
-        over = (errors / deviations[name]).square().flatten(0, 1).mean(0).sqrt()
-        values[name] = unknown.value(parameters[name])
-        sure[name] = deviations[name] * over.clamp_min(1)
+        moved = unknown.told(found[name]) - unknown.told(usual[name])
+        values[name] = unknown.value(found[name])
+        sure[name] = (deviations[name].square() + moved.square()).sqrt()
     return values, sure
 
 
-def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor], Tensor]:
-    """The parameters of brightness and drift, their deviations beside the volume, and the images."""
+def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor], float | None]:
+    """The parameters of brightness and drift, their deviations beside the volume, and the priors' last weight."""
     problem = beside.problem(beside.setup)
     last = _last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
     index = next(u for u in problem.unknowns if u.name == "delta")
@@ -162,15 +161,7 @@ def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor],
     parameters = refined(unknowns, parameters, setup, problem.misfit, fidelity)
     nearby = Nearby(unknowns, parameters, setup, fidelity)
     deviations = standard_deviations(nearby, parameters, problem.misfit)
-    return parameters, deviations, nearby.recorded(parameters)
-
-
-def _with_noise(images: Tensor, beside: Beside) -> Tensor:
-    """The images with noise as strong as what they leave of the part's data."""
-    misfit = beside.misfit
-    left = misfit.prism_means((misfit.counted(images) - misfit.data).square()).sqrt()[:, None, None, None]
-    random = torch.Generator().manual_seed(0)
-    return images + left * torch.randn(images.shape, generator=random, dtype=images.dtype).to(images.device)
+    return parameters, deviations, float(last.weights[-1]["tv"]) if last.weights else None
 
 
 def _last(problem: Problem) -> Step:

@@ -113,15 +113,16 @@ def _of_orders(orders: Orders | None, config: Config) -> FoundQuantity:
     chosen = next(tried for tried in orders.tried if tried.otherwise is orders.chosen)
     others = [tried for tried in orders.tried if tried is not chosen and tried.rounds == chosen.rounds]
     unit = orders.noise or 1.0
-    how = f"short fits of {len(orders.tried)} descriptions: misfit {chosen.misfit / unit:.2f} × the noise's"
+    how = f"short fits of {len(orders.tried)} descriptions: misfit {chosen.misfit / unit:.3f} × the noise's"
     if others:
         nearest = min(others, key=lambda tried: (tried.otherwise is not orders.rival, tried.loss))
-        how += f", {nearest.misfit / unit:.2f} × with {nearest.otherwise.name}"
+        how += f", {nearest.misfit / unit:.3f} × with {nearest.otherwise.name}"
     limits = bounds_of(config).lower, bounds_of(config).upper
     if None in limits and 0 not in limits:
         how += "; the sign of Δn is free: signs and planes reversed together explain the images as well with −Δn"
     if orders.rival is not None:
-        how += f"; the images can't tell {orders.chosen.name!r} from {orders.rival.name!r}: noise alone moves a misfit so far"
+        how += f"; the images can't tell {orders.chosen.name!r} from {orders.rival.name!r}: "
+        how += "noise alone moves a misfit so far"
         how += "" if orders.chosen.mistakes else ", so what was declared stays"
     if orders.chosen.mistakes:
         how += f"; {orders.chosen.what}: {orders.chosen.advice}"

@@ -33,7 +33,8 @@ def provenance(
     turned = _by_orders(told.acquisition, orders)
     for place, parts in enumerate(_of_prisms(declared, now.acquisition, by_name)):
         key = f"{_PRISMS}[{place}]"
-        if parts := turned[place] | {part: _behind(turned[place].get(part, ""), words) for part, words in parts.items()}:
+        before = turned[place]
+        if parts := before | {part: _behind(before.get(part, ""), words) for part, words in parts.items()}:
             made[key] = _with_parts(comments.get(key, ""), parts)
     if orders is not None and "signs and orders" in by_name:
         made |= _of_orders(told, orders, comments)
@@ -69,9 +70,7 @@ def _by_orders(told: Acquisition, orders: Orders | None) -> list[dict[str, str]]
     return changed
 
 
-def _of_prisms(
-    declared: Acquisition, now: Acquisition, found: Mapping[str, FoundQuantity]
-) -> Iterator[dict[str, str]]:
+def _of_prisms(declared: Acquisition, now: Acquisition, found: Mapping[str, FoundQuantity]) -> Iterator[dict[str, str]]:
     """Of each prism where its length, its angle and its bias come from, as far as they were found."""
     axes, sheared = axes_of(declared), 0
     for axis, prism, calibrated in zip(axes, declared.prisms, now.prisms, strict=True):
