@@ -271,9 +271,9 @@ def test_an_unknown_specimen_tells_the_shears_direction():
 )
 def test_drift_is_found_within_three_deviations(drift, noise):
     """In a stack without drift none is found, beside a volume that is fitted to the noise too."""
-    grid, sides = Grid((6, 28, 26), (0.5, 0.2, 0.2)), torch.tensor([1.0, -1.0, 1.0, -1.0])
-    true = drift * torch.stack((sides, -sides / 2), 1).expand(2, 4, 2)
-    acquisition = Acquisition([Prism((0.06, 0.18), rad(b)) for b in (75, -75)], (-1.5, -0.5, 0.5, 1.5))
+    grid, sides = Grid((5, 24, 22), (0.6, 0.2, 0.2)), torch.tensor([1.0, -2.0, 1.0])
+    true = drift / 2 * torch.stack((sides, -sides / 2), 1).expand(2, 3, 2)
+    acquisition = Acquisition([Prism((0.06, 0.18), rad(b)) for b in (75, -75)], (-1.2, 0.0, 1.2))
     microscope = Microscope(0.546, Objective(0.8), Condenser(0.5))
     bead = Bead(1.2, 0.03, 1.4, (0.1, 0.3, -0.4)).delta(grid, dtype=torch.float32)
     with torch.no_grad():
