@@ -3,6 +3,7 @@
     python benchmarks/calibration.py orders [SEED ...]      drawn recordings, told with the wrong sign or order or not
     python benchmarks/calibration.py beads [NAME ...]       beads of known size and index, from their exact fields
     python benchmarks/calibration.py specimens [SEED ...]   drawn recordings of unknown specimens
+    python benchmarks/calibration.py drifts [SEED ...]      the same, told right: the drift of their images
 
 The recordings are those of `data_synthetic.recorder`: a finer model, a camera's counts, tilt, flicker, drift and hot
 pixels; and a user who is off by up to 10° in bias, 15 % in the shear's length and 10° in its axis, and doesn't know its
@@ -26,12 +27,13 @@ import torch
 
 from data_synthetic import Bead
 from data_synthetic.recorder.drawn import Drawn, drawn
-from data_synthetic.recorder.told import tell
+from data_synthetic.recorder.told import Mistakes, tell
+from recon.calibration.beside_volume import find_images
 from recon.cli.calibrate import known_bead
 from recon.config import Config, load
 from recon.config.schema import BeadSection
 from recon.run.calibration.by_bead import by_bead
-from recon.run.calibration.by_specimen import by_specimen
+from recon.run.calibration.by_specimen import PLANES, by_specimen
 from recon.run.calibration.calibrate import bounds_of
 from recon.run.calibration.found import FoundQuantity
 from recon.run.calibration.stack import CalibrationStack
@@ -240,7 +242,33 @@ def specimens(options: argparse.Namespace) -> None:
         print("| " + " | ".join(cells) + " |", flush=True)
 
 
-COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {"orders": orders, "beads": beads, "specimens": specimens}
+def drifts(options: argparse.Namespace) -> None:
+    """The drift of drawn recordings that are told right."""
+    print("| drawn | specimen | settings | true, µm | error, µm | largest error / deviation |\n" + "|---" * 6 + "|")
+    for seed in options.names or SEEDS:
+        scene = drawn(int(seed))
+        scene = replace(scene, told=tell(scene.recording, Mistakes()))
+        beside = of_drawn(scene).beside(PLANES)
+        values, deviations = find_images(beside)
+        shifts = scene.recording.faults.shifts(len(scene.recording.acquisition.focus))[list(beside.part.planes)]
+        true = (shifts - shifts.mean(0)).expand_as(values["drift"])
+        error = values["drift"] - true
+        cells = (
+            str(seed),
+            scene.kind,
+            str(len(error)),
+            *(f"{float(part.square().mean().sqrt()):.3f}" for part in (true, error)),
+            f"{float((error / deviations['drift']).abs().max()):.1f}",
+        )
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "orders": orders,
+    "beads": beads,
+    "specimens": specimens,
+    "drifts": drifts,
+}
 
 
 def main() -> int:

@@ -5,13 +5,15 @@ import math
 import tomllib
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tomli_w
 import torch
 
 from data_synthetic import Bead
-from recon.calibration.trials.declared import Otherwise
-from recon.calibration.trials.orders import Orders, Round
+from recon.calibration.trials.declared import Otherwise, all_mistakes
+from recon.calibration.trials.orders import Orders, Round, Tried
+from recon.calibration.trials.profile import least_misfit
 from recon.cli import main
 from recon.config import load
 from recon.config.commented import comments_of
@@ -226,7 +228,9 @@ def test_a_calibrated_configuration_is_the_old_one_with_what_was_found(tmp_path,
     write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
     (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
     assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 0
-    assert "shear's angle: 310 ± 0.57°, told 300°" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "shear's angle: 310 ± 0.57°, told 300°" in said.out
+    assert "signs and orders, round 1 of 1: 100%" in said.err
     text = (tmp_path / "out" / "calibrated.toml").read_text(encoding="utf-8")
     told, values, comments = tomllib.loads(RUN), tomllib.loads(text), comments_of(text)
     chosen = json.loads((tmp_path / "out" / "calibration.json").read_text())["signs and orders"]["value"]
@@ -281,6 +285,89 @@ def test_provenance_says_what_was_calibrated_and_how_well(tmp_path):
     added = provenance(config, config, None, zero, {})["acquisition.prisms[1]"]
     assert added == "bias calibrated: the zero, 5.73° ± 0.57°, is added to the told -90°"
     assert provenance(config, config, None, [left("bias", "rad", None, "no")], comments) == {}
+
+
+def test_what_was_measured_of_a_told_angle_is_not_said_of_another(tmp_path):
+    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
+    config, comments = load(tmp_path / "run.toml"), comments_of(RUN)
+    turned = Acquisition([Prism(direction(0.3, 30.0), p.bias) for p in config.acquisition.prisms], FOCUS)
+    found = [FoundQuantity("signs and orders", "", "as declared", "turned", None, "so")]
+    now = replace(config, acquisition=turned)
+    made = provenance(config, now, orders("images turned", turned, 1), found, comments)["acquisition.prisms[0]"]
+    assert made.startswith("a: length assumed: usual; told; angle calibrated: images turned, told 300°; bias assumed")
+    angle = [*found, FoundQuantity("shear's angle", "rad", [math.radians(30)], [math.radians(31)], [0.05], "agrees")]
+    made = provenance(config, now, orders("images turned", turned, 1), angle, comments)["acquisition.prisms[0]"]
+    assert "angle calibrated: images turned, told 300°, calibrated: 31° ± 2.9° agrees; bias" in made
+    told = provenance(config, config, None, angle[1:], comments)["acquisition.prisms[0]"]
+    assert "angle measured: ± 2°, calibrated: 31° ± 2.9° agrees; bias" in told
+
+
+def trials(to, noise, fall, lowest=1.0):
+    """The least misfit of trials with a parabola about a value, which falls by a share of the noise from 0 to there."""
+
+    def misfits_at(value):
+        return np.full(4, noise * (lowest + fall * (value / to - 1) ** 2))
+
+    return least_misfit(misfits_at, 0.0, 0.12, noise, 60000, (-1, 1))
+
+
+@pytest.mark.parametrize(
+    ("lowest", "found", "words"),
+    [(1.0, True, "misfit 1.000 × the noise's, 1.004 as told"), (0.983, False, "absorb 1.7% of the noise")],
+)
+def test_a_told_value_stays_where_noise_that_volumes_absorb_may_be_why_another_fits(
+    tmp_path, recorded, monkeypatch, capsys, lowest, found, words
+):
+    """The misfit falls by as much from the told aperture and angle in both cases."""
+    beside = "recon.run.calibration.by_specimen"
+
+    def aperture(stack):
+        return trials(-0.2, stack.alone, 0.004, lowest)
+
+    monkeypatch.setattr("recon.calibration.beside_volume.Beside.held", lambda self: self)
+    monkeypatch.setattr(f"{beside}.find_aperture", aperture)
+    monkeypatch.setattr(f"{beside}.find_angles", lambda stack: [trials(0.15, stack.alone, 0.004, lowest)])
+    monkeypatch.setattr(f"{beside}._images", lambda stack: (stack, []))
+    patches = (("recon.run.calibration.stack.CalibrationStack.orders", lambda *_: None),)
+    told = {"acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 14, 1.3)}}
+    config, record = calibrated(tmp_path, recorded, monkeypatch, told, patches)
+    assert record["condenser na"]["found"] == record["shear's angle"]["found"] == found
+    assert words in record["condenser na"]["how"]
+    assert words in record["shear's angle"]["how"]
+    na, degrees = (0.5 * math.exp(-0.2), 14 + math.degrees(0.15)) if found else (0.5, 14)
+    assert float(config.microscope.condenser.na) == pytest.approx(na, abs=1e-4)
+    assert math.degrees(math.atan2(*config.acquisition.prisms[0].shear)) == pytest.approx(degrees, abs=1e-2)
+
+
+def test_descriptions_that_noise_alone_tells_apart_are_both_named(tmp_path, recorded, monkeypatch, capsys):
+    def alike(stack, _):
+        declared, other = all_mistakes(stack.config.acquisition)[:2]
+        tried = Tried(declared, 0.502, 0.503, 1), Tried(other, 0.5, 0.501, 1)
+        return Orders(tried, 0.5, declared, told=False, rival=other)
+
+    patches = (
+        ("recon.run.calibration.stack.CalibrationStack.orders", alike),
+        ("recon.run.calibration.calibrate.by_specimen", lambda stack, _: (stack, [])),
+    )
+    told = {"acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 14, 1.3)}, "assumed": ["order of the planes"]}
+    config, record = calibrated(tmp_path, recorded, monkeypatch, told, patches)
+    assert not record["signs and orders"]["found"]
+    assert config.assumed == ("order of the planes",)
+    assert "the images can't tell 'as declared' from 'focus': " in capsys.readouterr().out
+
+
+def test_an_interrupted_calibration_says_so_in_one_line(tmp_path, recorded, monkeypatch, capsys):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("recon.run.calibration.stack.CalibrationStack.orders", stopped)
+    write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    told = {**TOLD, "acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}}
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 130
+    assert "interrupted; a calibration writes nothing" in capsys.readouterr().err.splitlines()[-1]
+    assert not list((tmp_path / "out").glob("calib*"))
 
 
 def test_levels_of_one_exposure_tell_the_compensators_zero(tmp_path, recorded, monkeypatch):

@@ -111,6 +111,16 @@ def reversed_shears(acquisition):
     return [Prism((-p.shear[0], -p.shear[1]), p.bias) for p in acquisition.prisms]
 
 
+def test_what_was_declared_stays_where_noise_alone_tells_the_descriptions_apart(truth, monkeypatch):
+    """And another description that explains the images as well is named."""
+    monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(8, 3, 2, 6), Round(2, 4, 3, 6)))
+    found = orders_of(0.01 * truth, PAIR, WRONG["sign"])
+    assert found.chosen.name == "as declared"
+    assert not found.told
+    assert found.rival is not None
+    assert found.rival.mistakes > 0
+
+
 WRONG = {
     "as declared": PAIR,
     "sign": Acquisition(reversed_shears(PAIR), FOCUS),
@@ -129,6 +139,7 @@ def test_the_race_finds_what_was_declared_wrongly(truth, name, monkeypatch):
     assert found.chosen.name == name
     assert images_of(found.chosen.acquisition) == images_of(PAIR)
     assert found.told
+    assert found.rival is None
     assert name in found.table()
 
 

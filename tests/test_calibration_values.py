@@ -8,7 +8,7 @@ import torch
 
 import recon.calibration.known_specimen as known
 from data_synthetic import Bead
-from recon.calibration.beside_volume import Beside, find_angles
+from recon.calibration.beside_volume import Beside, find_angles, find_images
 from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
 from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.levels import biases_of_levels
@@ -21,8 +21,10 @@ from recon.calibration.optics import (
     axes_of,
 )
 from recon.calibration.part import part_of
-from recon.calibration.trials.profile import least_misfit
+from recon.calibration.trials.profile import FREEDOM, least_misfit
+from recon.fit.bounds import Bounds
 from recon.fit.problem import Recipe
+from recon.fit.setup import Setup
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -96,6 +98,15 @@ def test_images_that_disagree_make_the_least_uncertain():
 
 def test_a_misfit_without_a_least_within_the_limits_tells_nothing():
     assert least_misfit(lambda v: np.array([0.1 + 0.01 * v]), 0.0, 0.12, 0.1, 100, (-1, 1)).deviation == math.inf
+
+
+def test_noise_that_volumes_absorb_makes_the_least_uncertain():
+    """Where the best volume leaves less than the noise, that it leaves still less elsewhere may be freedom alone."""
+    absorbed, curvature, pixels = 0.002, 1.0, 1000
+    found = least_misfit(lambda v: np.full(4, 0.098 + (v - 0.05) ** 2), 0.0, 0.12, 0.1, pixels, (-1, 1))
+    assert found.deviation == pytest.approx(math.sqrt((0.1 / pixels + FREEDOM * absorbed) / curvature), rel=1e-6)
+    assert found.absorbed == pytest.approx(absorbed / 0.1)
+    assert found.told == pytest.approx(0.098 + 0.05**2)
 
 
 # --- unknowns ---------------------------------------------------------------------------------------------------------
@@ -253,3 +264,24 @@ def test_an_unknown_specimen_tells_the_shears_direction():
     error = found.value - math.atan2(0.06, 0.18)
     assert abs(error) < rad(3)
     assert abs(error) < 3 * max(found.deviation, rad(0.3))
+
+
+@pytest.mark.parametrize(
+    ("drift", "noise"), [(0.1, 0.004), *(pytest.param(drift, 0.02, marks=pytest.mark.slow) for drift in (0.0, 0.1))]
+)
+def test_drift_is_found_within_three_deviations(drift, noise):
+    """In a stack without drift none is found, beside a volume that is fitted to the noise too."""
+    grid, sides = Grid((5, 24, 22), (0.6, 0.2, 0.2)), torch.tensor([1.0, -2.0, 1.0])
+    true = drift / 2 * torch.stack((sides, -sides / 2), 1).expand(2, 3, 2)
+    acquisition = Acquisition([Prism((0.06, 0.18), rad(b)) for b in (75, -75)], (-1.2, 0.0, 1.2))
+    microscope = Microscope(0.546, Objective(0.8), Condenser(0.5))
+    bead = Bead(1.2, 0.03, 1.4, (0.1, 0.3, -0.4)).delta(grid, dtype=torch.float32)
+    with torch.no_grad():
+        setup = Setup(Volume(grid, bead, 1.4), microscope, acquisition, drift=true)
+        images = setup.images(Fidelity("wave", sources=30))
+    data = images + noise * torch.randn(images.shape, generator=torch.Generator().manual_seed(1))
+    part = part_of(data, None, grid)
+    beside = Beside(part, part.setup(1.4, microscope, acquisition), Recipe(bounds=Bounds(0.0, None)), [noise] * 2)
+    found, deviations = find_images(beside)
+    assert float(((found["drift"] - true).abs() / deviations["drift"]).max()) < 3
+    assert float(deviations["drift"].max()) < 0.1

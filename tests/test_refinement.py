@@ -16,7 +16,7 @@ from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
 from recon.fit.nuisances.nearby import Nearby
-from recon.fit.nuisances.refinement import best_brightness, refined
+from recon.fit.nuisances.refinement import Beforehand, best_brightness, refined
 from recon.fit.nuisances.shear import ShearError
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
@@ -421,3 +421,36 @@ def test_a_descent_of_nuisances_goes_there_as_here(method, steps):
         there = descended(send(data))
     for name, value in there.items():
         torch.testing.assert_close(bring(value), here[name], rtol=1e-6, atol=1e-9)
+
+
+def test_what_is_known_of_a_drift_beforehand_pulls_it_to_zero():
+    """Its first and second derivative are those of differences, and nothing else is pulled."""
+    exact = setup(dtype=torch.float64, drift=DRIFT.double())
+    misfit = GaussianMisfit(exact.images(FIDELITY))
+    unknowns = [Brightness(), Drift()]
+    here = {"brightness": BRIGHTNESS.double().log(), "drift": 0.5 * DRIFT.double()}
+    objective = Beforehand(unknowns, misfit, unit=2e-3)
+    second, first = objective.pull(here)
+    toward = torch.randn(DRIFT.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    toward = toward - toward.mean((0, 1))
+    scaled = torch.cat((torch.zeros(BRIGHTNESS.numel(), dtype=torch.float64), toward.flatten()))
+    scale = refinement.SCALE * Drift().step
+
+    def outside(steps):
+        return objective(misfit.data, {**here, "drift": here["drift"] + steps * scale * toward})
+
+    up, middle, down = outside(1e-3), outside(0.0), outside(-1e-3)
+    assert (up - down) / 2e-3 == pytest.approx(float((first * scaled).sum()), rel=1e-6)
+    assert (up - 2 * middle + down) / 1e-6 == pytest.approx(float((second * scaled**2).sum()), rel=1e-4)
+    assert not first[: BRIGHTNESS.numel()].any()
+
+
+def test_images_that_say_nothing_of_their_place_stay_where_they_are():
+    """Noise alone is no drift: it stays within the width that a drift has beforehand."""
+    faint = setup(acquisition=TRUE)
+    faint = replace(faint, volume=Volume(GRID, 1e-3 * faint.volume.delta, BACKGROUND))
+    with torch.no_grad():
+        images = faint.images(FIDELITY)
+    data = images + 0.01 * torch.randn(images.shape, generator=torch.Generator().manual_seed(0))
+    found = repeated([Brightness(), Drift()], faint, GaussianMisfit(data), 1)
+    assert float(found["drift"].abs().max()) < 0.01 * Drift.width

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from recon.calibration.optics import CondenserAperture, ShearOfAxes, axes_of
 from recon.calibration.part import Part
@@ -29,6 +30,9 @@ from torchdic import Fidelity
 
 # Steps and condenser directions of a fit.
 STEPS, SOURCES = 8, 18
+
+# The part of the priors' weight beside which brightness and drift are told.
+LIGHT = 0.25
 
 # Distance of the trials: of the shear's angle in rad, and of the logarithm of the condenser's NA.
 ANGLE, APERTURE = 0.12, 0.12
@@ -82,10 +86,17 @@ class Beside:
         squares = misfit.where_counted((images - misfit.data).square()) / misfit.variance
         return squares.mean((2, 3)).flatten().double().numpy()
 
-    def least(self, changed: Callable[[float], Setup], step: float, limits: tuple[float, float]) -> Least:
-        """The change of the optics, 0 as declared, with the least misfit."""
+    def least(self, name: str, changed: Callable[[float], Setup], step: float, limits: tuple[float, float]) -> Least:
+        """The change of the optics, 0 as declared, with the least misfit. name: of what is changed, for the user."""
         counted = int(self.misfit.pixels.sum())
-        return least_misfit(lambda value: self.misfits(changed(value)), 0.0, step, self.alone, counted, limits)
+        with tqdm(desc=name, unit="volume") as bar:
+
+            def misfits_at(value: float) -> np.ndarray:
+                found = self.misfits(changed(value))
+                bar.update()
+                return found
+
+            return least_misfit(misfits_at, 0.0, step, self.alone, counted, limits)
 
 
 def find_angles(beside: Beside) -> list[Least]:
@@ -101,7 +112,7 @@ def find_angles(beside: Beside) -> list[Least]:
             entries[axis, 1] = angle
             return unknown.put(unknown.of_entries(entries), beside.setup)
 
-        found.append(beside.least(changed, ANGLE, (-0.8, 0.8)))
+        found.append(beside.least(f"shear's angle {axis + 1}", changed, ANGLE, (-0.8, 0.8)))
         turned[axis, 1] = found[-1].value
     return found
 
@@ -115,11 +126,31 @@ def find_aperture(beside: Beside) -> Least:
     def changed(logarithm: float) -> Setup:
         return unknown.put(torch.tensor(logarithm, dtype=torch.float64).exp(), beside.setup)
 
-    return beside.least(changed, APERTURE, (-1.0, 0.7))
+    return beside.least("condenser's NA", changed, APERTURE, (-1.0, 0.7))
 
 
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name."""
+    """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name.
+
+    Priors draw a volume in, and a drift makes up for a part of what it lacks then. So the values are those beside a
+    volume whose priors have a part of their usual weight, and how far they moved with it is in the deviations.
+    """
+    with tqdm(total=2, desc="brightness and drift", unit="volume") as bar:
+        usual, _, weight = _images_found(beside)
+        bar.update()
+        found, deviations, _ = _images_found(beside if weight is None else replace(beside, weight=LIGHT * weight))
+        bar.update()
+    values, sure = {}, {}
+    for unknown in (Brightness(), Drift()):
+        name = unknown.name
+        moved = unknown.told(found[name]) - unknown.told(usual[name])
+        values[name] = unknown.value(found[name])
+        sure[name] = (deviations[name].square() + moved.square()).sqrt()
+    return values, sure
+
+
+def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor], float | None]:
+    """The parameters of brightness and drift, their deviations beside the volume, and the priors' last weight."""
     problem = beside.problem(beside.setup)
     last = _last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
     index = next(u for u in problem.unknowns if u.name == "delta")
@@ -129,8 +160,8 @@ def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     fidelity = Fidelity("wave", sources=SOURCES)
     parameters = refined(unknowns, parameters, setup, problem.misfit, fidelity)
     nearby = Nearby(unknowns, parameters, setup, fidelity)
-    values = {u.name: u.value(parameters[u.name]) for u in unknowns}
-    return values, standard_deviations(nearby, parameters, problem.misfit)
+    deviations = standard_deviations(nearby, parameters, problem.misfit)
+    return parameters, deviations, float(last.weights[-1]["tv"]) if last.weights else None
 
 
 def _last(problem: Problem) -> Step:

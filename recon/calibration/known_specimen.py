@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from tqdm import tqdm
 
 from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.optics import (
@@ -120,7 +121,7 @@ def find_optics(
         parameters = {u.name: u.start(setup, misfit) for u in unknowns}
         parameters |= _placed(setup, misfit, ROUNDS[0][0])
         coarse = parameters
-        for sources, most in ROUNDS:
+        for sources, most in tqdm(ROUNDS, desc="bead", unit="round"):
             if zernike and len(parameters) == len(unknowns) and sources == ROUNDS[1][0]:
                 unknowns.append(Aberrations(tuple(zernike)))
                 parameters[unknowns[-1].name] = unknowns[-1].start(setup, misfit)

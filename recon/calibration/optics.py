@@ -22,6 +22,7 @@ from torchdic.scalar import number
 class Displacement(Drift):
     """Where the specimen's picture is in each image, (prism, focus, 2) in µm (y, x) from where the model has it."""
 
+    width = None
     centred = False
 
 

@@ -11,6 +11,7 @@ from recon.config.reading import load
 from recon.config.rewritten import Source
 from recon.config.schema import BeadSection, ConfigError
 from recon.run.calibration.calibrate import calibrate
+from recon.run.interruption import InterruptedRunError
 from torchdic import Grid
 
 
@@ -22,7 +23,10 @@ def run(options: argparse.Namespace) -> None:
     section = config.calibration.bead
     bead = None if section is None else known_bead(section, config.volume.background)
     source = Source.of(options.config)
-    calibrate(config, options.out, options.device, bead, source=source, restart=options.restart)
+    try:
+        calibrate(config, options.out, options.device, bead, source=source, restart=options.restart)
+    except KeyboardInterrupt:
+        raise InterruptedRunError("interrupted; a calibration writes nothing before it has found all") from None
 
 
 def known_bead(section: BeadSection, background: float) -> ModelledSpecimen:

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from tqdm import tqdm
+
 from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
 from recon.calibration.trials.short_fits import last_step
 from recon.fit.problem import Problem, Recipe
@@ -35,8 +37,9 @@ ROUNDS = (Round(10_000, 10, 2, 8), Round(4, 12, 6, 12), Round(2, 20, 8, 18))
 LIKELY, STANDS_OUT = 2, 0.5
 
 # A description is preferred to the declared one only where it lowers what that leaves by this share, the noise left
-# out: a wrong sign, order or axis leaves far more.
-LEAST = 0.05
+# out: a wrong sign, order or axis leaves far more. Near the noise next to nothing is left, and such a share of it is
+# less than what noise moves a misfit by: so it must fall by this many of the misfit's standard errors, too.
+LEAST, SURE = 0.05, 3.0
 
 # Makes the problem of an acquisition of the whole stack, with so many slices, by a recipe.
 ProblemOf = Callable[[Acquisition, int, Recipe], Problem]
@@ -60,13 +63,15 @@ class Orders:
     """What the short fits say.
 
     tried: all descriptions, the best first: those of the last round, then those of the one before it. noise: what noise
-    leaves of the misfit. chosen: the one to go by. told: whether the images tell it from the next best.
+    leaves of the misfit. chosen: the one to go by. told: whether the images tell it from the next best. rival: another
+    one from which they don't, the closest.
     """
 
     tried: tuple[Tried, ...]
     noise: float
     chosen: Otherwise
     told: bool
+    rival: Otherwise | None = None
 
     def table(self, most: int = 8) -> str:
         """The best descriptions and their misfits over the noise's, as a table; `most` rows."""
@@ -104,20 +109,23 @@ def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, no
         recipe = _held(recipe, race.fitted(racing[0], number, recipe))
         race.run(racing, number, recipe)
     ranked = sorted(race.tried.values(), key=lambda tried: (-tried.rounds, tried.loss))
-    return _chosen(tuple(ranked), race.alone)
+    return _chosen(tuple(ranked), race.alone, race.pixels)
 
 
 class _Race:
-    """Short fits of descriptions, round by round. tried: their last ones. alone: what noise leaves of the misfit."""
+    """Short fits of descriptions, round by round.
+
+    tried: their last ones. alone: what noise leaves of the misfit. pixels: how many count in it.
+    """
 
     def __init__(self, problem_of: ProblemOf, noise: Sequence[float] | None) -> None:
         self._problem_of, self._noise = problem_of, noise
         self.tried: dict[object, Tried] = {}
-        self.alone = 0.0
+        self.alone, self.pixels = 0.0, 1
 
     def run(self, racing: Sequence[Otherwise], number: int, recipe: Recipe) -> None:
         """Fit each description as a round asks for."""
-        for other in racing:
+        for other in tqdm(racing, desc=f"signs and orders, round {number} of {len(ROUNDS)}", unit="fit"):
             last = self.fitted(other, number, recipe)
             misfit, loss = (math.inf, math.inf) if last is None else (last.misfit, last.loss)
             self.tried[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)
@@ -126,7 +134,7 @@ class _Race:
         """The last step of a description's short fit; None where its light can't be followed."""
         this = ROUNDS[number - 1]
         problem = self._problem_of(other.acquisition, this.slices, recipe)
-        self.alone = problem.misfit.of_noise(self._noise) or 0.0
+        self.alone, self.pixels = problem.misfit.of_noise(self._noise) or 0.0, int(problem.misfit.pixels.sum())
         return last_step(problem, this.steps, this.sources)
 
     def best(self, most: int) -> list[Otherwise]:
@@ -149,16 +157,21 @@ def _held(recipe: Recipe, last: Step | None) -> Recipe:
     return recipe.held(float(last.weights[-1]["tv"]))
 
 
-def _chosen(ranked: tuple[Tried, ...], noise: float) -> Orders:
+def _chosen(ranked: tuple[Tried, ...], noise: float, pixels: int) -> Orders:
     last = [tried for tried in ranked if tried.rounds == len(ROUNDS)]
     declared = next(tried for tried in last if tried.otherwise.mistakes == 0)
     best = last[0]
-    gained = (declared.loss - best.loss) / max(declared.loss - noise, 1e-12)
-    chosen = best if gained > LEAST else declared
+    by_noise = SURE * max(noise, best.misfit) * math.sqrt(2 / pixels)
+
+    def worse(one: Tried, than: Tried) -> bool:
+        """Whether one explains the images so much worse that noise isn't why."""
+        return one.loss - than.loss > max(LEAST * (one.loss - noise), by_noise, 1e-12)
+
+    chosen = best if worse(declared, best) else declared
     others = [tried for tried in last if tried is not chosen]
-    nearest = min((tried.loss for tried in others), default=math.inf)
-    told = nearest == math.inf or (nearest - chosen.loss) > LEAST * max(nearest - noise, 1e-12)
-    return Orders(ranked, noise, chosen.otherwise, told)
+    rivals = [tried for tried in others if not worse(tried, chosen)]
+    rival = min(rivals, key=lambda tried: tried.loss, default=None)
+    return Orders(ranked, noise, chosen.otherwise, rival is None, rival.otherwise if rival else None)
 
 
 def _key(other: Otherwise) -> object:

@@ -13,6 +13,10 @@ MOVES, NARROWED = 6, 0.5
 # A least that lies further than this many steps from the trials' middle isn't believed, and the search moves there.
 WITHIN = 0.6
 
+# A volume that leaves less than the noise has absorbed the rest of it, more with some values than with others: that
+# alone may change the misfit by this share of what was absorbed.
+FREEDOM = 0.1
+
 # The misfit of each image, relative to its prism's spatial variance, of a volume that was fitted with a value.
 MisfitsAt = Callable[[float], Float[np.ndarray, " image"]]
 
@@ -22,12 +26,18 @@ class Least:
     """Where the misfit is least.
 
     value: there. deviation: one standard deviation; infinite where the misfit has no least. tried: the values of the
-    trials and their mean misfits.
+    trials and their mean misfits. absorbed: the share of the noise that the best volume has absorbed.
     """
 
     value: float
     deviation: float
     tried: tuple[tuple[float, float], ...]
+    absorbed: float = 0.0
+
+    @property
+    def told(self) -> float:
+        """The misfit of the trial nearest to 0, which is as told."""
+        return min(self.tried, key=lambda trial: abs(trial[0]))[1]
 
 
 def least_misfit(
@@ -39,7 +49,8 @@ def least_misfit(
     pixels: of all images. limits: the least and the greatest value.
 
     The deviation is the larger of what the noise says, by the curvature of the misfit, inflated by the misfit over the
-    noise's, and of how much the images disagree, each of which is left out in turn (a jackknife).
+    noise's, or by what the volume has absorbed of the noise, and of how much the images disagree, each of which is left
+    out in turn (a jackknife).
     """
     known: dict[float, np.ndarray] = {}
 
@@ -69,13 +80,14 @@ def least_misfit(
         else:
             return Least(first, math.inf, _table(known))
         middle = least
-    return Least(least, _deviation(values, misfits, noise, pixels), _table(known))
+    absorbed = max(0.0, 1 - min(mean for _, mean in _table(known)) / noise) if noise > 0 else 0.0
+    return Least(least, _deviation(values, misfits, noise, pixels), _table(known), absorbed)
 
 
 def _deviation(values: Sequence[float], misfits: Float[np.ndarray, "trial image"], noise: float, pixels: int) -> float:
     curvature, _ = _parabola(values, misfits.mean(1))
     lowest = float(misfits.mean(1).min())
-    by_noise = math.sqrt(max(noise, lowest) / (curvature * pixels))
+    by_noise = math.sqrt((max(noise, lowest) / pixels + FREEDOM * max(0.0, noise - lowest)) / curvature)
     images = misfits.shape[1]
     if images < 2:
         return by_noise

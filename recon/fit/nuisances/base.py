@@ -21,12 +21,15 @@ class Nuisance(Unknown):
     that one set of images with all such entries moved shows what each of them does. The parameter's other axes have
     their own set each.
     centred: whether only the differences between those entries can be told: their mean plays no part in the value.
+    width: one standard deviation of its entries about 0 before an image is seen, in the parameter's unit; None where
+    nothing is known of them, and in Adam's descent, which goes by the images alone.
     forms: whether it acts on how images are formed; if not, on their recording alone, and nothing is propagated anew.
     `put` then replaces what was there.
     """
 
     learning_rate: float
     step: float
+    width: ClassVar[float | None] = None
     axes: ClassVar[tuple[Literal["prism", "focus"], ...]] = ()
     centred: ClassVar[bool] = False
     forms: ClassVar[bool] = True

@@ -13,12 +13,14 @@ from recon.misfit.base import Misfit
 class Drift(Nuisance):
     """How far the picture has moved in each image, (prism, focus, 2) in µm (y, x), with a mean of 0 over the images.
 
-    A shift that all images share is the volume's own place, which Δn says.
+    A shift that all images share is the volume's own place, which Δn says. A stage or a prism moves the picture by some
+    hundredths of a µm: images that say nothing of their place, such as planes far out of focus, stay near 0.
     learning_rate, step: in µm.
     """
 
     learning_rate: float = 5e-3
     step: float = 0.02
+    width = 0.05
     name = "drift"
     axes = ("prism", "focus")
     centred = True

@@ -31,6 +31,9 @@ MODEL_APERTURE, MODEL_ANGLE = 0.05, math.radians(0.5)
 # A value within so many standard deviations of what was told agrees with it.
 AGREES = 2.0
 
+# A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
+SHOWS = 4.0
+
 SCALE = "it sets the scale of Δn: with an unknown specimen another Δn explains the images as well; use a bead"
 
 
@@ -76,14 +79,26 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
     name, unit = DIRECTION, "rad"
     if max(least.deviation for least in found) > UNSURE_ANGLE:
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
-        return stack, left(name, unit, told, why)
-    turned = torch.tensor([[1.0, least.value] for least in found], dtype=torch.float64)
+        return stack, left(name, unit, told, why + _hidden(found, beside))
+    deviations = [math.hypot(least.deviation, MODEL_ANGLE) for least in found]
     values = [rounded(t + least.value, 5) for t, least in zip(told, found, strict=True)]
-    sure = [rounded(math.hypot(least.deviation, MODEL_ANGLE), 2) for least in found]
-    how = f"volumes fitted with {_tried(found)} directions, misfit {_best(found, beside)}; from right towards down"
+    sure = [rounded(deviation, 2) for deviation in deviations]
+    how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; from right towards down"
+    off = [abs(least.value) >= AGREES * deviation for least, deviation in zip(found, deviations, strict=True)]
+    if not any(off):
+        how += "; it agrees with what was told, which stays"
+        return stack, FoundQuantity(name, unit, told, values, sure, how)
+    if not all(off):
+        how += "; an axis that agrees with what was told stays as it was"
+    # a value that agrees is no better known than the told one, and priors move it
+    turns = [least.value if is_off else 0.0 for least, is_off in zip(found, off, strict=True)]
     unknown = ShearOfAxes(axes_of(config.acquisition))
+    turned = torch.tensor([[1.0, turn] for turn in turns], dtype=torch.float64)
     made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
-    prisms = [None if prism is None else rounded_shear(prism) for prism in made.prisms]
+    prisms = [
+        rounded_shear(new) if new is not None and off[axis] else old
+        for new, old, axis in zip(made.prisms, config.acquisition.prisms, axes_of(config.acquisition), strict=True)
+    ]
     calibrated = replace(config, acquisition=replace(made, prisms=prisms))
     return stack.with_config(calibrated), FoundQuantity(name, unit, told, values, sure, how)
 
@@ -101,10 +116,11 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
         return stack, [left(name, "", before, f"{why}, which would be put down to it")]
     deviation = math.hypot(found.deviation, MODEL_APERTURE)
     if deviation > UNSURE_APERTURE:
-        return stack, [left(name, "", before, "volumes explain the images as well with other apertures")]
+        why = "volumes explain the images as well with other apertures"
+        return stack, [left(name, "", before, why + _hidden([found], beside))]
     na = rounded(before * math.exp(found.value), 4)
     sure = rounded(na * deviation, 2)
-    how = f"volumes fitted with {_tried([found])} apertures, misfit {_best([found], beside)}"
+    how = f"volumes fitted with {_tried([found])} apertures, {_misfits([found], beside)}"
     if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
         return stack, [FoundQuantity(name, "", before, na, sure, how)]
@@ -125,11 +141,13 @@ def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuanti
             "brightness", "", None, plain(lit, 5), plain(deviations["brightness"] * lit, 2), f"{how}; always learned"
         )
     ]
-    shows = bool((drift.abs() > 3 * deviations["drift"]).any())
+    shows = bool((drift.abs() > SHOWS * deviations["drift"]).any())
     learn = config.reconstruction.learn
     if shows and "drift" not in learn:
         how += "; it shows, so that the reconstruction learns it"
         config = replace(config, reconstruction=replace(config.reconstruction, learn=(*learn, "drift")))
+    if not shows:
+        how += f"; none is {SHOWS:g} standard deviations from 0: no drift shows"
     found.append(FoundQuantity("drift", "µm", None, plain(drift, 3), plain(deviations["drift"], 2), how))
     return stack.with_config(config), found
 
@@ -143,8 +161,16 @@ def _tried(found: list[Least]) -> int:
     return sum(len(least.tried) for least in found)
 
 
-def _best(found: list[Least], beside: Beside) -> str:
-    lowest, highest = (pick(m for least in found for _, m in least.tried) for pick in (min, max))
+def _misfits(found: list[Least], beside: Beside) -> str:
+    """The misfit as found, after the last value, and as told, before the first."""
+    told, lowest = found[0].told, min(misfit for _, misfit in found[-1].tried)
     if beside.alone == 0:
-        return f"{lowest:.3g} to {highest:.3g}"
-    return f"{lowest / beside.alone:.2f} to {highest / beside.alone:.2f} × the noise's"
+        return f"misfit {lowest:.4g}, {told:.4g} as told"
+    return f"misfit {lowest / beside.alone:.3f} × the noise's, {told / beside.alone:.3f} as told"
+
+
+def _hidden(found: list[Least], beside: Beside) -> str:
+    """Why a value isn't told: the misfits, and what they have absorbed of the noise."""
+    absorbed = max(least.absorbed for least in found)
+    hides = f"; they absorb {absorbed:.1%} of the noise, which may be why" if absorbed > 0 else ""
+    return f" ({_misfits(found, beside)}{hides})"

@@ -84,7 +84,8 @@ def calibrate(
     for quantity in found:
         print(quantity.words)
     print(f"not told by any image: {'; '.join(GAUGES)}")
-    calibration = Calibration(_known(stack.config, found), orders, tuple(found))
+    known = [quantity for quantity in found if quantity is not found[0] or (orders is not None and orders.told)]
+    calibration = Calibration(_known(stack.config, known), orders, tuple(found))
     write_calibration(out, config, calibration, GAUGES, source or Source(), with_microscope=bead is not None)
     return calibration
 
@@ -112,15 +113,18 @@ def _of_orders(orders: Orders | None, config: Config) -> FoundQuantity:
     chosen = next(tried for tried in orders.tried if tried.otherwise is orders.chosen)
     others = [tried for tried in orders.tried if tried is not chosen and tried.rounds == chosen.rounds]
     unit = orders.noise or 1.0
-    how = f"short fits of {len(orders.tried)} descriptions: misfit {chosen.misfit / unit:.2f} × the noise's"
+    how = f"short fits of {len(orders.tried)} descriptions: misfit {chosen.misfit / unit:.3f} × the noise's"
     if others:
-        nearest = min(others, key=lambda tried: tried.misfit)
-        how += f", {nearest.misfit / unit:.2f} × with {nearest.otherwise.name}"
+        nearest = min(others, key=lambda tried: (tried.otherwise is not orders.rival, tried.loss))
+        how += f", {nearest.misfit / unit:.3f} × with {nearest.otherwise.name}"
     limits = bounds_of(config).lower, bounds_of(config).upper
     if None in limits and 0 not in limits:
         how += "; the sign of Δn is free: signs and planes reversed together explain the images as well with −Δn"
-    if not orders.told:
-        how += "; the images hardly tell these two apart"
+    if orders.rival is not None:
+        how += f"; the images can't tell {orders.chosen.name!r} from {orders.rival.name!r}: "
+        how += "noise alone moves a misfit so far"
+        how += "" if orders.chosen.mistakes else ", so what was declared stays"
     if orders.chosen.mistakes:
         how += f"; {orders.chosen.what}: {orders.chosen.advice}"
-    return FoundQuantity(name, "", before, orders.chosen.name, None, how, told=orders.told)
+    # a changed description is found, even where another one explains the images as well as it
+    return FoundQuantity(name, "", before, orders.chosen.name, None, how, orders.told or orders.chosen.mistakes > 0)

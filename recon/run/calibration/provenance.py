@@ -14,6 +14,9 @@ from torchdic.scalar import number
 # How `torchdic new` says of a prism where its parts come from.
 _PARTS = re.compile(r"(?P<setting>.*?)length (?P<length>.*); angle (?P<angle>.*); bias (?P<bias>.*)")
 
+# Angles that differ by less, in degrees, are the same; and what parts a told value's origin from what agrees with it.
+SAME, AGREES = 1e-6, ", "
+
 _PRISMS, _FOCUS = "acquisition.prisms", "acquisition.focus"
 
 
@@ -27,9 +30,11 @@ def provenance(
     by_name = {quantity.name: quantity for quantity in found if quantity.told}
     declared = told.acquisition if orders is None else orders.chosen.acquisition
     made: dict[str, str] = {}
-    for place, parts in enumerate(_of_prisms(declared, by_name)):
+    turned = _by_orders(told.acquisition, orders)
+    for place, parts in enumerate(_of_prisms(declared, now.acquisition, by_name)):
         key = f"{_PRISMS}[{place}]"
-        if parts:
+        before = turned[place]
+        if parts := before | {part: _behind(before.get(part, ""), words) for part, words in parts.items()}:
             made[key] = _with_parts(comments.get(key, ""), parts)
     if orders is not None and "signs and orders" in by_name:
         made |= _of_orders(told, orders, comments)
@@ -49,10 +54,26 @@ def provenance(
     return made
 
 
-def _of_prisms(declared: Acquisition, found: Mapping[str, FoundQuantity]) -> Iterator[dict[str, str]]:
+def _by_orders(told: Acquisition, orders: Orders | None) -> list[dict[str, str]]:
+    """Of each prism the parts that signs and orders have changed: what was measured of the told ones isn't of these."""
+    changed: list[dict[str, str]] = [{} for _ in told.prisms]
+    if orders is None:
+        return changed
+    for parts, before, prism in zip(changed, told.prisms, orders.chosen.acquisition.prisms, strict=True):
+        if before is None or prism is None:
+            continue
+        (_, angle, bias), (_, turned, other) = _polar(before), _polar(prism)
+        if abs((turned - angle + 180) % 360 - 180) > SAME:
+            parts["angle"] = f"calibrated: {orders.chosen.what}, told {angle % 360:.4g}°"
+        if abs(other - bias) > SAME:
+            parts["bias"] = f"calibrated: {orders.chosen.what}, told {bias:.4g}°"
+    return changed
+
+
+def _of_prisms(declared: Acquisition, now: Acquisition, found: Mapping[str, FoundQuantity]) -> Iterator[dict[str, str]]:
     """Of each prism where its length, its angle and its bias come from, as far as they were found."""
     axes, sheared = axes_of(declared), 0
-    for axis, prism in zip(axes, declared.prisms, strict=True):
+    for axis, prism, calibrated in zip(axes, declared.prisms, now.prisms, strict=True):
         if prism is None:
             yield {}
             continue
@@ -62,6 +83,9 @@ def _of_prisms(declared: Acquisition, found: Mapping[str, FoundQuantity]) -> Ite
             parts["length"] = _calibrated(quantity.uncertainty[axis], length, " µm")
         if (quantity := found.get("shear's angle")) is not None:
             parts["angle"] = _calibrated(math.degrees(quantity.uncertainty[axis]), angle % 360, "°")
+            if calibrated == prism and quantity.value[axis] != quantity.before[axis]:
+                sure = f"± {math.degrees(quantity.uncertainty[axis]):.2g}°"
+                parts["angle"] = f"{AGREES}calibrated: {math.degrees(quantity.value[axis]) % 360:.4g}° {sure} agrees"
         if (quantity := found.get("bias")) is not None:
             parts["bias"] = _calibrated(math.degrees(quantity.uncertainty[sheared]), bias, "°")
         elif (quantity := found.get("compensator's zero")) is not None:
@@ -85,10 +109,15 @@ def _with_parts(comment: str, parts: Mapping[str, str]) -> str:
     """A prism's comment, in which some parts are replaced; where it says none, they stand behind it."""
     known = _PARTS.fullmatch(comment)
     if known is None:
-        words = "; ".join(f"{part} {words}" for part, words in parts.items())
+        words = "; ".join(f"{part} {words.removeprefix(AGREES)}" for part, words in parts.items())
         return f"{comment}; {words}" if comment else words
-    said = "; ".join(f"{part} {parts.get(part, known[part])}" for part in ("length", "angle", "bias"))
-    return known["setting"] + said
+    said = {part: parts.get(part, known[part]) for part in ("length", "angle", "bias")}
+    return known["setting"] + "; ".join(f"{part} {_behind(known[part], words)}" for part, words in said.items())
+
+
+def _behind(origin: str, words: str) -> str:
+    """New words about a part: behind where its value comes from if they agree with that, else in its place."""
+    return origin + words if words.startswith(AGREES) else words
 
 
 def _of_orders(told: Config, orders: Orders, comments: Mapping[str, str]) -> dict[str, str]:
