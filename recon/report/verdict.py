@@ -197,7 +197,7 @@ def judged(
     method: str,
     rows: Sequence[Row],
     assumed: Sequence[str] = (),
-    delta: Float[Tensor, "z y x"] | None = None,
+    delta: Float[Tensor, "z row column"] | None = None,
 ) -> Verdict:
     """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
 
