@@ -153,6 +153,7 @@ def test_axes_that_are_nearly_across_one_another_have_no_twin():
     assert len(all_mistakes(declared)) == len(all_mistakes(across))
 
 
+@pytest.mark.slow
 def test_more_mistakes_are_tried_only_where_fewer_explain_nothing(truth, monkeypatch):
     monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(8, 3, 2, 6), Round(2, 4, 3, 6)))
     several = [other for other in all_mistakes(PAIR) if other.mistakes > LIKELY]

@@ -216,6 +216,7 @@ def test_the_default_method_explains_the_noise_and_errs_least(recorded):
     assert linear.whole_over_noise > newton.whole_over_noise
 
 
+@pytest.mark.slow
 def test_planes_that_were_left_out_tell_what_was_missed(recorded):
     """One plane is explained as well as its noise allows, and the other planes are not."""
     (trial,) = fit_trials(shortened(recorded), [FitCandidate("newton", "wave", 18, 1)])

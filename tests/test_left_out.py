@@ -118,6 +118,7 @@ def test_stuck_pixels_may_count(run, counts):
     assert float((found - clean).norm() / clean.norm()) > 0.5
 
 
+@pytest.mark.slow
 def test_a_clean_stack_leaves_nothing_out(run, counts):
     _, out, _, found, metrics, resolved = run(counts)
     assert metrics["left_out"] == {"stuck": 0, "saturated": 0, "masked": 0, "share": 0.0}

@@ -322,7 +322,14 @@ def by_pixels():
     return find
 
 
-@pytest.mark.parametrize("pixel", [0.2, 0.15, 0.1 / 1.5], ids=["twice", "1.5 times", "1/1.5"])
+@pytest.mark.parametrize(
+    "pixel",
+    [
+        pytest.param(0.2, id="twice", marks=SLOW),
+        pytest.param(0.15, id="1.5 times"),
+        pytest.param(0.1 / 1.5, id="1/1.5", marks=SLOW),
+    ],
+)
 def test_a_cameras_pixels_may_be_coarser_or_finer_than_voxels(by_pixels, pixel):
     """The error is near that on equal pixels."""
     assert by_pixels(pixel) < 1.25 * by_pixels(None)

@@ -218,6 +218,7 @@ def test_an_empty_mask_and_a_method_without_voxels_are_refused_in_one_line(run):
         assert said in err
 
 
+@pytest.mark.slow
 def test_memory_is_foreseen_with_a_support():
     """On few voxels, whose support is another."""
     grid = Grid((4, 48, 44), (0.5, 0.2, 0.2))
