@@ -299,9 +299,10 @@ class _Descent:
         memory = self.problem.fidelity.matrices or draft.memory // 2
         pixels, seen = math.prod(misfit.data.shape[2:]), math.prod(setup.field.shape[1:])
         weights = self.voxels * pixels / seen * curvature  # a camera's pixel stands for the voxels that it sees
-        fewer = exact is not None and draft.sources < exact.sources
+        self.missed = None
         room = MissedResponse.bytes_for(setup, weights.element_size()) <= memory
-        self.missed = MissedResponse(setup, draft, exact) if exact is not None and fewer and room else None
+        if exact is not None and draft.sources < exact.sources and room:
+            self.missed = MissedResponse(setup, draft, exact)
         return WeakHessian(setup, weights, draft, memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:

@@ -10,13 +10,12 @@ by which the linear difference comes nearest to the true one.
 from dataclasses import replace
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from torch import Tensor
 
+from recon.fit.newton.weak_hessian import weak_responses
 from recon.fit.setup import Setup
 from torchdic import Fidelity
-from torchdic.linear import transfer_functions
-from torchdic.scalar import number
 
 
 class MissedResponse:
@@ -27,7 +26,8 @@ class MissedResponse:
     """
 
     def __init__(self, setup: Setup, draft: Fidelity, careful: Fidelity) -> None:
-        many, few = (self._responses(setup, replace(draft, sources=f.sources)) for f in (careful, draft))
+        like = setup.volume.delta
+        many, few = (weak_responses(setup, replace(draft, sources=f.sources), like) for f in (careful, draft))
         prisms, planes, _, ny, half = many.shape
         # one matrix for each lateral frequency, (image, slice)
         self._matrix = (many - few).permute(3, 4, 0, 1, 2).reshape(ny, half, prisms * planes, -1).contiguous()
@@ -39,13 +39,6 @@ class MissedResponse:
         prisms, planes = len(setup.acquisition.prisms), len(setup.acquisition.focus)
         nz, ny, nx = setup.volume.grid.shape
         return 2 * 3 * element * prisms * planes * nz * ny * nx
-
-    @staticmethod
-    def _responses(setup: Setup, fidelity: Fidelity) -> Complex[Tensor, "prism focus z y half"]:
-        volume, microscope = setup.volume, replace(setup.microscope, camera=None)
-        given = {"dtype": volume.delta.dtype, "device": volume.delta.device}
-        T = transfer_functions(volume.grid, microscope, setup.acquisition, number(volume.background), fidelity, **given)
-        return T[..., : volume.grid.shape[2] // 2 + 1]
 
     def __call__(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "prism focus y x"]:
         """The difference of the images, relative to the empty bright field, on the volume's pixels; differentiable."""

@@ -35,6 +35,17 @@ DARK = 1e-4
 Inverse = tuple[Complex[Tensor, "y half low low"], Float[Tensor, "y half high"]]
 
 
+def weak_responses(setup: Setup, fidelity: Fidelity, like: Tensor) -> Complex[Tensor, "prism focus z y half"]:
+    """The images' responses on voxels to each slice of a weak specimen, at the frequencies of a real FFT.
+
+    setup: of which the weak specimen is one; its volume's Δn plays no part. like: gives the dtype and the device.
+    """
+    volume, microscope = setup.volume, replace(setup.microscope, camera=None)
+    given = {"dtype": like.dtype, "device": like.device}
+    T = transfer_functions(volume.grid, microscope, setup.acquisition, number(volume.background), fidelity, **given)
+    return T[..., : volume.grid.shape[2] // 2 + 1]
+
+
 class WeakHessian:
     """The Hessian of a misfit times the number of voxels, for the means that the priors are.
 
@@ -71,11 +82,9 @@ class WeakHessian:
     ) -> Complex[Tensor, "y half prism cosine"]:
         """The images' responses at one focus to each cosine, times the roots of the images' weights."""
         one = Acquisition(setup.acquisition.prisms, (number(focus),))
-        microscope = replace(setup.microscope, camera=None)
         volume = setup.volume
-        given = {"dtype": weights.dtype, "device": weights.device}
-        T = transfer_functions(volume.grid, microscope, one, number(volume.background), fidelity, **given)[:, 0]
-        T = T[..., : volume.grid.shape[2] // 2 + 1] * weights.sqrt()[:, None, None, None]
+        T = weak_responses(replace(setup, acquisition=one, brightness=None, drift=None), fidelity, weights)[:, 0]
+        T = T * weights.sqrt()[:, None, None, None]
         camera = setup.microscope.camera
         if camera is not None and not setup.sees_voxels:
             _, ny, nx = volume.grid.shape
