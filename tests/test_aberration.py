@@ -419,6 +419,7 @@ def test_rays_that_a_plate_traps_are_counted_in_an_error():
 # --- Figure 4 ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_figure_4_shows_a_depression_that_pulls_up_what_lies_beneath(monkeypatch, tmp_path, capsys):
     spec = importlib.util.spec_from_file_location("figure4_experiment", FIGURE)
     figure4 = importlib.util.module_from_spec(spec)

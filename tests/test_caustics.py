@@ -153,6 +153,7 @@ def test_empty_slices_behind_do_not_show(momentum, options):
     torch.testing.assert_close(far, near, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_image_of_a_ball_that_focuses_inside_the_volume_is_the_waves(monkeypatch):
     """The fields of axial and oblique sources through a strong ball whose focus lies inside the volume.
 

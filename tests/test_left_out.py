@@ -83,9 +83,8 @@ def _fast(no_pictures):
 
 METHODS = [
     {"method": "newton"},
-    {"method": "adam"},
     {"method": "linear"},
-    pytest.param({"method": "opl"}, marks=pytest.mark.slow, id="opl"),
+    *(pytest.param({"method": name}, marks=pytest.mark.slow, id=name) for name in ("adam", "opl")),
 ]
 MISFITS = [pytest.param({"misfit": name}, marks=pytest.mark.slow, id=name) for name in ("poisson", "robust")]
 

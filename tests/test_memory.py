@@ -26,6 +26,7 @@ from torchdic import (
 )
 from torchdic.forward import foresee
 from torchdic.memory import free as machine
+from torchdic.memory.budget import Batches
 from torchdic.planning.work_precision import peak_bytes
 
 GRID = Grid((7, 26, 30), (0.3, 0.2, 0.21))
@@ -72,6 +73,7 @@ DEAR = (
     "rays-double",
     "rays-turned",
     "rays-padded",
+    "rays",
     "wave-leaky",
 )
 CASES = [
@@ -214,6 +216,28 @@ def test_without_a_gradient_less_is_foreseen(specimen):
         alone = foreseen(volume, SCOPE, ACQUISITION)
     assert alone == foreseen(specimen(), SCOPE, ACQUISITION) == foreseen(volume, SCOPE, ACQUISITION, gradient=False)
     assert alone.peak < foreseen(volume, SCOPE, ACQUISITION).peak / 2
+
+
+@pytest.mark.parametrize("sources", [1, 40])
+@pytest.mark.parametrize("name", [*SCENES, "wave-cubic", "wave-cubic-lenses-double"])
+def test_no_scene_holds_more_than_what_spares_its_measurement(name, sources, specimen):
+    """A scene that fits by a number of bytes a pixel is not measured: whatever it is, it must hold less."""
+    more = {
+        "wave-cubic": (Fidelity("wave", interpolation="cubic", padding=4), {}),
+        "wave-cubic-lenses-double": (
+            Fidelity("wave", interpolation="cubic", steps=14),
+            {"scope": replace(SCOPE, polarisation=LENSES), "dtype": torch.float64, "absorbing": True},
+        ),
+    }
+    fidelity, parts = (SCENES | more)[name]
+    scope = parts.get("scope", SCOPE)
+    points = POINTS[torch.arange(sources) % len(POINTS)]
+    scope = replace(scope, condenser=replace(scope.condenser, points=points))
+    volume = specimen(parts.get("dtype", torch.float32), absorbing=parts.get("absorbing", False))
+    with torch.no_grad():
+        scene = volume, scope, parts.get("acquisition", ACQUISITION), fidelity
+        room, ample, _ = foresee._demand(*scene, 0 if fidelity.object_aberration is None else 3)
+        assert room._peak(Batches(sources)) < ample
 
 
 def test_a_learned_lens_or_medium_is_kept_too(specimen):

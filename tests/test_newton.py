@@ -236,7 +236,7 @@ def test_an_unknown_noise_ends_with_a_white_residual(scene):
 @pytest.mark.parametrize(
     ("sign", "bounds"),
     [
-        (-1, Bounds(None, 0.0)),
+        pytest.param(-1, Bounds(None, 0.0), marks=SLOW),
         (1, Bounds(0.0, 0.015)),
         pytest.param(-1, Bounds(None, None), marks=SLOW),
         pytest.param(1, Bounds(None, 0.05), marks=SLOW),
@@ -258,7 +258,7 @@ def test_bounds_are_kept_exactly_and_either_sign_is_found(sign, bounds):
     ("acquisition", "most"),
     [
         (Acquisition([Prism((0.1, 0.2), 1.5)], [0.2]), 0.85),
-        (Acquisition([Prism((0.0, 0.24), 1.5), None], [-1.2, 0.0, 1.2]), 0.35),
+        pytest.param(Acquisition([Prism((0.0, 0.24), 1.5), None], [-1.2, 0.0, 1.2]), 0.35, marks=SLOW),
         pytest.param(Acquisition([None], [-1.0, 1.0]), 0.7, marks=SLOW),
     ],
     ids=["one image", "with bright field", "bright field"],

@@ -405,6 +405,7 @@ def test_the_converged_wave_is_finite_where_only_thin_slabs_carry_the_light():
     assert {way.fidelity.steps for way in ways if way.fidelity.order == 2} >= {192, 384}
 
 
+@pytest.mark.slow
 def test_slabs_that_carry_a_few_sources_but_not_all_are_not_chosen():
     """Of the pilot's sources none makes energy in 24 slabs, of 50 two do."""
     scene = strong(0.3)
@@ -486,8 +487,9 @@ def test_specimens_one_voxel_wide_reach_the_sides_and_stay_cylinders():
 
 @pytest.mark.parametrize(
     "condenser",
-    [Condenser(0.78, inner_na=0.7), *(pytest.param(Condenser(na), marks=pytest.mark.slow) for na in (0.765, 1.1))],
+    [Condenser(0.78, inner_na=0.7), Condenser(0.765), Condenser(1.1)],
 )
+@pytest.mark.slow
 def test_a_condenser_that_the_pupils_edge_divides_is_planned_for(condenser):
     grid = Grid((8, 48, 52), (0.4, 0.14, 0.14))
     ball = volume(GaussianBall(0.8, 0.02, 1.36).delta(grid), grid)
@@ -712,11 +714,10 @@ def test_simulate_and_reconstruct_run_what_the_plan_says_and_say_so(write, tmp_p
     assert tomllib.loads(text)["tolerance"] == 0.2
 
 
-@pytest.mark.parametrize(
-    "recipe", [pytest.param(CONFIG["reconstruction"], marks=pytest.mark.slow), ADAM], ids=["newton", "adam"]
-)
+@pytest.mark.parametrize("recipe", [CONFIG["reconstruction"], ADAM], ids=["newton", "adam"])
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_a_planned_reconstruction_goes_on_bit_for_bit(write, tmp_path, monkeypatch, recipe):
     path = write(reconstruction=recipe)
     assert run("simulate", path, "--out", tmp_path / "out") == 0

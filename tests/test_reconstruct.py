@@ -584,6 +584,7 @@ def stopped(other, eight, tmp_path):
     return other({"reconstruction": {"steps": 8}}), tmp_path / "out"
 
 
+@pytest.mark.slow
 def test_a_run_that_dies_between_checkpoints_goes_on_from_the_last(other, monkeypatch, workplace, tmp_path):
     """As a killed one does: nothing is saved on its way out."""
     path, out = other(), tmp_path / "out"
@@ -693,7 +694,8 @@ def test_resume_without_an_interrupted_run_begins_one(other, tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::recon.report.verdict.PoorFitWarning")  # seven steps of Adam
-@pytest.mark.parametrize("method", [pytest.param("newton", marks=pytest.mark.slow), "adam"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["newton", "adam"])
 def test_a_run_may_be_interrupted_again_and_again(other, interrupt, tmp_path, method):
     path, out = other({"reconstruction": {"method": method, "steps": 7}}), tmp_path / "out"
     assert command("reconstruct", path, "--out", tmp_path / "whole")[0] == 0

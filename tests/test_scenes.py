@@ -98,6 +98,7 @@ def test_images_are_not_those_of_the_model_that_fits_them(small):
     assert float(error.min()) > 0.01
 
 
+@pytest.mark.slow
 def test_images_don_t_depend_on_the_margin(small):
     """Nothing that reaches the recorded field comes from the other side of the simulated one."""
     images, wider = replace(small, margin=16).images(), replace(small, margin=24).images()

@@ -16,7 +16,6 @@ import torch
 from torchdic.fidelity import Fidelity
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.forward.sample import Sample, VolumeSample, field_sample
-from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope, check_apertures, limited
 from torchdic.memory.budget import Batches, Foreseen, fitted, least_of
 from torchdic.memory.free import check_room, free_bytes
@@ -30,8 +29,9 @@ from torchdic.specimen.volume import Volume
 # 1.4 times as fast (fields of 192² pixels, 50 sources) or more (rays at 256² pixels, 13 sources).
 CACHED = 32 << 20
 # More bytes than any scene holds for each source and pixel. With a gradient they count for each slice and image. If a
-# scene fits into its budget even by this number, it is computed at once and not measured.
-AMPLE = 2048
+# scene fits into its budget even by this number, it is computed at once and not measured. Without a gradient a
+# propagation's own number may be less, and each slice and image takes less than FLAT once, for all sources.
+AMPLE, FLAT = 2048, 32
 # The map of an object aberration serves all sources: it holds less than this many times AMPLE for each pixel and slice.
 MAP = 40
 # From so many sources on, a condenser's inner ring has as many as a sample takes: any number of them holds alike.
@@ -74,8 +74,8 @@ def check_fits(volume: Volume, microscope: Microscope, acquisition: Acquisition,
 
     An object aberration, whose map is not computed for this, is taken to be weak.
     """
-    room, kept, grid, what = _demand(volume, microscope, acquisition, fidelity, 0)
-    room.check_fits(kept, grid, what)
+    room, ample, what = _demand(volume, microscope, acquisition, fidelity, 0)
+    room.check_fits(ample, what)
 
 
 def allot(
@@ -86,8 +86,8 @@ def allot(
     levels: number of levels of an object aberration.
     Raises ShortOfMemoryError if even single sources, whose steps are computed again, need more memory than is free.
     """
-    room, kept, grid, what = _demand(volume, microscope, acquisition, fidelity, levels)
-    return room.allot(kept, grid, fidelity.memory, what)
+    room, ample, what = _demand(volume, microscope, acquisition, fidelity, levels)
+    return room.allot(ample, fidelity.memory, what)
 
 
 def allot_fields(passage: FieldPassage) -> Batches:
@@ -105,8 +105,8 @@ def allot_fields(passage: FieldPassage) -> Batches:
     key = signature(parts), replace(fidelity, memory=1)
     room = _Room(key, make, sources, passage.transmission.device, is_learned(parts), small_batches=False)
     _, ny, nx = passage.grid.shape
-    kept = sources * (prisms * planes if room.gradient else 1)
-    return room.allot(kept, grid, fidelity.memory, f"{prisms} × {planes} images of {ny}×{nx} pixels")
+    ample = AMPLE * sources * (prisms * planes if room.gradient else 1) * math.prod(grid.shape[1:])
+    return room.allot(ample, fidelity.memory, f"{prisms} × {planes} images of {ny}×{nx} pixels")
 
 
 @dataclass(frozen=True)
@@ -129,23 +129,23 @@ class _Room:
         batches = self._fitted(self._budget(memory, None))
         return Foreseen(self._peak(batches), self._least, batches.sources, batches.slabs)
 
-    def check_fits(self, kept: int, grid: Grid, what: str) -> None:
+    def check_fits(self, ample: int, what: str) -> None:
         """Raise ShortOfMemoryError where the scene needs more memory than is free; see `allot`."""
         free = free_bytes(self.device)
-        if free is None or AMPLE * kept * math.prod(grid.shape[1:]) <= free:
+        if free is None or ample <= free:
             return
         if self._peak(Batches(self.sources)) > free:
             check_room(self._least, free, what)
 
-    def allot(self, kept: int, grid: Grid, memory: int, what: str) -> Batches:
+    def allot(self, ample: int, memory: int, what: str) -> Batches:
         """The batches that fit into a budget and into what is free. Raises ShortOfMemoryError where none do.
 
-        kept: at most, in AMPLE bytes for each pixel of the grid. what: the scene, for the message.
+        ample: more bytes than the scene holds. what: the scene, for the message.
         """
         budget = self._budget(memory, free_bytes(self.device))
-        if AMPLE * kept * math.prod(grid.shape[1:]) <= budget:
+        if ample <= budget:
             return Batches(self.sources)
-        self.check_fits(kept, grid, what)
+        self.check_fits(ample, what)
         return self._fitted(budget)
 
     def _budget(self, memory: int, free: int | None) -> int:
@@ -175,16 +175,22 @@ class _Room:
 
 def _demand(
     volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity, levels: int
-) -> "tuple[_Room, int, Grid, str]":
-    """The room of a volume's scene, what it keeps at most (see `_Room.allot`), its padded grid, and its name."""
+) -> "tuple[_Room, int, str]":
+    """The room of a volume's scene, more bytes than the scene holds, and its name."""
     room = _room_for(volume, microscope, acquisition, fidelity, levels)
-    grid = volume.grid.widened(fidelity.padding, fidelity.padding)
-    slices, prisms, planes = grid.shape[0], len(acquisition.prisms), len(acquisition.focus)
-    of_source = slices + prisms * planes + levels if room.gradient else 1
-    of_map = 0 if fidelity.object_aberration is None else MAP * (slices if room.gradient else 1)
+    prisms, planes = len(acquisition.prisms), len(acquisition.focus)
+    layers = max(volume.grid.shape[0], fidelity.steps or 0) + prisms * planes
+    if room.gradient:
+        of_pixel = AMPLE * room.sources * (layers + levels)
+    else:
+        own = propagation_of(fidelity).ample * volume.delta.dtype.itemsize // torch.float32.itemsize
+        of_pixel = (AMPLE if levels else min(own, AMPLE)) * room.sources + FLAT * layers
+    if fidelity.object_aberration is not None:
+        of_pixel += AMPLE * MAP * (layers if room.gradient else 1)
+    pixels = math.prod(volume.grid.widened(fidelity.padding, fidelity.padding).shape[1:])
     shape = "×".join(map(str, volume.grid.shape))
     what = f'{prisms} prism settings × {planes} focus planes of {shape} voxels by "{fidelity.propagation}"'
-    return room, room.sources * of_source + of_map, grid, what
+    return room, of_pixel * pixels, what
 
 
 def _room_for(

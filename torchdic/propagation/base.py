@@ -51,6 +51,8 @@ class Propagation(ABC):
     carries_polarisation: whether its light carries its polarisation along, which matters behind strained lenses.
     small_batches: whether small batches of sources are faster than large ones whose steps are computed again.
     holds_by_content: whether its memory depends on how much of the array is empty.
+    ample: more bytes than images without a gradient hold for each source and pixel, in float32. Scenes that fit by it
+        aren't measured before they are computed.
     """
 
     name: ClassVar[str]
@@ -58,6 +60,7 @@ class Propagation(ABC):
     carries_polarisation: ClassVar[bool] = False
     small_batches: ClassVar[bool] = False
     holds_by_content: ClassVar[bool] = False
+    ample: ClassVar[int] = 2048
 
     def check(self, fidelity: Fidelity) -> None:  # noqa: B027  (most have nothing to forbid)
         """Raise ValueError if a fidelity asks for something that this propagation can't do."""

@@ -22,6 +22,7 @@ class Wave(Propagation):
     """The one-way wave equation, solved in slabs."""
 
     name = "wave"
+    ample = 192
 
     def check(self, fidelity: Fidelity) -> None:
         """A wave needs no object aberration: its field spreads by itself."""
