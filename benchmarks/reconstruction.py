@@ -4,8 +4,8 @@ method.
     python benchmarks/reconstruction.py scenes [NAME ...] [--drawn N] [--method adam] [--cache DIR]
     python benchmarks/reconstruction.py ablation [NAME ...] [--cache DIR]
     python benchmarks/reconstruction.py acquisitions [cell bead] [--cache DIR]
-    python benchmarks/reconstruction.py nuisances | propagations | methods | stuck | support | verdicts | mistakes
-                                        [--cache DIR]
+    python benchmarks/reconstruction.py nuisances | propagations | planned | methods | stuck | support | verdicts |
+                                        mistakes [--cache DIR]
 
 "error" is the relative L2 error of Δn over the volume, "mass" the sum of Δn over the true one, "misfit/noise" the final
 misfit over what noise alone leaves, for a clean stack the misfit itself. Seconds are processor seconds of one thread.
@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -30,6 +31,7 @@ from torch import Tensor
 import scenes
 from recon.earlier.path_length import path_length
 from recon.earlier.tikhonov import tikhonov
+from recon.fit import planned
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.newton import correction, descent
@@ -52,6 +54,8 @@ from scenes import Scene
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
+
+T = TypeVar("T")
 
 # Scenes on which parts of the recipe are left out.
 SOME = ("two beads", "cell", "bead", "fibres", "cell, 400 photons", "cell, 40000 photons", "cell, Δn × 3")
@@ -97,14 +101,15 @@ def setup_of(scene: Scene, margin: int | None = None) -> Setup:
 def fit(
     scene: Scene,
     recipe: Recipe | None = None,
-    fidelity: Fidelity | None = None,
+    fidelity: Fidelity | float | None = None,
     setup: Setup | None = None,
     mask: Tensor | None = None,
     support: Tensor | None = None,
 ) -> Found:
     """Fit a scene by a recipe; None is the default one, at the recommended fidelity.
 
-    mask: the pixels that count. support: the voxels in which Δn is sought.
+    fidelity: or a tolerance, for which one is planned. mask: the pixels that count. support: the voxels in which Δn is
+        sought.
     """
     recipe = replace(recipe or Recipe(), bounds=Bounds(*scene.bounds))
     usual = RECOMMENDED if recipe.method == "newton" else RECOMMENDED_FOR_ADAM
@@ -369,6 +374,32 @@ def propagations(options: argparse.Namespace) -> None:
                 print(row(f"{name}, {fidelity.propagation}, {method}, centre {centre:.2f}", found), flush=True)
 
 
+def planned_for(options: argparse.Namespace) -> None:
+    """Fidelities that are planned for a tolerance: the error, seconds, and the plans' share of these."""
+    print("| scene | tolerance | directions | slabs | error | s | plans |\n" + "|---" * 7 + "|")
+    for name in options.names or SOME[:4]:
+        scene = scenes.scene(name, options.cache)
+        for tolerance in (0.1, 0.05, 0.02):
+            taken: list[float] = []
+            with patch.object(planned, "plan", _timed(planned.plan, taken)):
+                found = fit(scene, fidelity=tolerance)
+            last = planned.current(found.last.plans)
+            seconds = (f"{found.error:.3f}", f"{found.seconds:.1f}", f"{sum(taken) / found.seconds:.0%}")
+            print("| " + " | ".join((name, f"{tolerance:g}", str(last.sources), str(last.steps), *seconds)) + " |")
+
+
+def _timed(function: Callable[..., T], taken: list[float]) -> Callable[..., T]:
+    """A function that also notes its processor seconds."""
+
+    def timed(*arguments: object, **more: object) -> T:
+        began = time.process_time()
+        result = function(*arguments, **more)
+        taken.append(time.process_time() - began)
+        return result
+
+    return timed
+
+
 def methods(options: argparse.Namespace) -> None:
     """All methods on SOME scenes: errors."""
     print("| method | " + " | ".join(SOME) + " |\n" + "|---" * (len(SOME) + 1) + "|")
@@ -446,6 +477,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "acquisitions": acquisitions,
     "nuisances": nuisances,
     "propagations": propagations,
+    "planned": planned_for,
     "methods": methods,
     "stuck": stuck,
     "support": support,
