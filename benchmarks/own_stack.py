@@ -42,8 +42,8 @@ from recon.report.metrics import volume_error
 from torchdic import Grid
 from torchdic.files.stack import read_volume
 
-# A bead as it is sold for calibration: radius in µm, and Δn in a mounting medium of about its index.
-RADIUS, CONTRAST = 2.0, 0.03
+# A bead as it is sold for calibration, polystyrene in immersion oil: its radius in µm, its Δn, and the oil's index.
+RADIUS, CONTRAST, OIL = 2.0, 0.07, 1.52
 
 HEAD = (
     "| seed | specimen | prisms × planes | told wrong | signs, orders | bias off, ° | shear off, % | axis off, ° "
@@ -112,12 +112,12 @@ def typed(written: dict[str, Any], told: Told) -> dict[str, Any]:
 def by_bead(made: Drawn, out: Path) -> list[dict[str, Any]]:
     """The prisms that `torchdic calibrate` finds from a stack of a bead by the same microscope."""
     recording = made.recording
-    background, field = 1.56, recording.field
+    field = recording.field
     middle = float(np.mean([float(z) for z in recording.acquisition.focus]))
-    specimen = Bead(RADIUS, CONTRAST, background, (middle, 0.1, -0.2))
+    specimen = Bead(RADIUS, CONTRAST, OIL, (middle, 0.1, -0.2))
     seen = record(specimen, field, recording.microscope, recording.acquisition, recording.faults, seed=1)
-    values = typed(new(made, seen, out, "bead"), replace(made.told, background=background, lower=False))
-    values["calibration"] = {"bead": {"radius": RADIUS, "index": background + CONTRAST}}
+    values = typed(new(made, seen, out, "bead"), replace(made.told, background=OIL, lower=False))
+    values["calibration"] = {"bead": {"radius": RADIUS, "index": OIL + CONTRAST}}
     ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead", "--restart")
     return prisms_and_focus(out / "bead")[0]
 

@@ -86,8 +86,8 @@ def test_bright_field_and_prisms_are_told_apart():
     axes = panels(figures.draw_images(data, data + 1, PRISMS, (0.0,), GRID))
     labels = [axes[3 * p].get_ylabel() for p in range(3)]
     assert labels[1] == "bright field"
-    assert "shear (0, 0.24) µm" in labels[0]
-    assert "bias -1.2 rad" in labels[2]
+    assert labels[0] == "shear 0.24 µm\nat 0°\nbias 85.9°"
+    assert labels[2] == "shear 0.24 µm\nat 90°\nbias −68.8°"
 
 
 @pytest.mark.parametrize(("planes", "columns"), [(1, 1), pytest.param(7, 7, marks=pytest.mark.slow), (20, 7)])
@@ -148,6 +148,14 @@ def test_sections_go_through_the_centre_of_the_specimen(tmp_path, spot):
     assert [ax.get_title(loc="right") for ax in (xy, xz, yz)] == ["z = −0.25 µm", "y = 0.4 µm", "x = −0.625 µm"]
     assert any(ax.get_ylabel() == "Δn" for ax in figure.axes)
     drawn(figure, tmp_path / "sections.png")
+
+
+def test_sections_go_through_one_of_two_beads_and_not_between_them():
+    volume = torch.zeros(5, 20, 22)
+    volume[1:4, 3:7, 3:7] = 0.02
+    volume[1:4, 13:17, 14:18] = 0.03
+    xy, xz, yz = panels(figures.draw_sections({"": volume}, Grid((5, 20, 22), GRID.spacing)))
+    assert all(float(shown(ax).max()) == pytest.approx(0.03) for ax in (xy, xz, yz))
 
 
 def test_volumes_side_by_side_share_their_place_and_scale(spot):

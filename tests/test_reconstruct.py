@@ -407,6 +407,7 @@ def test_a_descent_that_diverges_leaves_earlier_results_alone(other, earlier):
     code, err = command("reconstruct", path, "--out", earlier, "--restart")
     assert code == 1
     assert "torchdic: error: the descent diverged at step 2: " in err
+    assert "a smaller learning_rate" in err
     assert "Traceback" not in err
     after = content(earlier)
     assert set(after) == RESULTS

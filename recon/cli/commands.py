@@ -106,7 +106,7 @@ def main(typed: Sequence[str] | None = None) -> int:
     except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
     except FloatingPointError as error:
-        return _fail(f"{error}; a smaller learning_rate or more tv may help", FAILED)
+        return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
     return 0

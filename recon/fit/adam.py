@@ -21,6 +21,9 @@ from torchdic.errors import UnstableError
 # noise.
 UNTIL_CONTRAST, BETWEEN_WEIGHTS = 0.2, 10
 
+# What the message about a descent that diverged ends with.
+ADVICE = "; a smaller learning_rate or more tv may help"
+
 
 @dataclass(frozen=True)
 class _Taken:
@@ -54,7 +57,8 @@ def minimise_by_adam(problem: Problem, resume: Step | None = None) -> Iterator[S
         plans, weights = taken.plans, taken.weights
         values = unknowns.values()
         delta = values.get(IndexDifference.name, problem.setup.volume.delta)
-        check_convergence(step + 1, taken.loss, values, float(problem.setup.volume.background) + float(delta.min()))
+        lowest = float(problem.setup.volume.background) + float(delta.min())
+        check_convergence(step + 1, taken.loss, values, lowest, ADVICE)
         passed, state = seconds + time.perf_counter() - started, unknowns.state(adam)
         yield Step(step + 1, taken.misfit, taken.loss, delta, passed, values, state, plans, weights)
 
@@ -73,7 +77,7 @@ def _move(
     try:
         images = setup.images(fidelity)
     except UnstableError as error:
-        raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}") from error
+        raise FloatingPointError(f"the descent diverged at step {step + 1}: {error}{ADVICE}") from error
     misfit = problem.misfit(images)
     delta = setup.volume.delta.detach()
     if step > 0 and step % BETWEEN_WEIGHTS == 0:

@@ -41,9 +41,12 @@ class Step:
         return self.number, self.misfit, self.loss, self.seconds
 
 
-def check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float) -> None:
-    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive."""
+def check_convergence(number: int, loss: float, values: dict[str, Tensor], lowest: float, advice: str = "") -> None:
+    """Raise FloatingPointError where a step led to numbers that are not finite, or to an index that isn't positive.
+
+    advice: what the message ends with.
+    """
     if not math.isfinite(loss) or not all(bool(torch.isfinite(value).all()) for value in values.values()):
-        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}")
+        raise FloatingPointError(f"the descent diverged at step {number}: the loss is {loss:g}{advice}")
     if lowest <= 0:
-        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}")
+        raise FloatingPointError(f"the descent diverged at step {number}: the index falls to {lowest:g}{advice}")

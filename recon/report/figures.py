@@ -1,6 +1,7 @@
 """Pictures of a reconstruction: images beside the model's, sections through the volume, and the fall of the misfit."""
 
 import io
+import math
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
+from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 from torchdic import Grid, Prism
@@ -24,6 +26,10 @@ MOST_PLANES = 7
 
 # Parts of the pixels that are darker and brighter than the scale of grey: a few hot pixels don't decide it.
 OUTSIDE = 0.002
+
+# A specimen's centre with less than this share of its largest |Δn|, both means over so many voxels along each axis, is
+# hollow: sections through it would show next to nothing.
+HOLLOW, AROUND = 0.3, 3
 
 # Mean width of a letter of 8 points.
 INCHES_PER_LETTER = 0.062
@@ -65,7 +71,7 @@ def draw_images(
     """
     planes = sorted({len(focus) // 4, len(focus) // 2, (3 * len(focus)) // 4})
     aspect = grid.extent[1] / grid.extent[2]
-    figure = Figure(figsize=(1.9 * 3 * len(planes) + 1.8, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
+    figure = Figure(figsize=(1.9 * 3 * len(planes) + 2.6, 1.9 * aspect * len(prisms) + 0.7), layout="constrained")
     axes = figure.subplots(len(prisms), 3 * len(planes), squeeze=False)
     residual = measured - modelled
     _, largest = _limits(residual[:, planes].abs())
@@ -83,7 +89,7 @@ def draw_images(
                 if p == 0:
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
             scale_bar(trio[0], grid.extent[2], "white")
-        axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
+        _name_row(axes[p, 0], prism)
         for ax, words in ((axes[p, -2], "intensity"), (axes[p, -1], "residual")):
             bar = figure.colorbar(ax.images[0], ax=ax, pad=0.02, aspect=15)
             bar.set_label(words, fontsize=8)
@@ -111,7 +117,8 @@ def draw_sections(
     volumes: Δn (z, y, x) by title.
     grid: of all volumes.
     planes: of "xy", "xz" and "yz", the horizontal axis first.
-    through: the voxel (z, y, x) in all sections; None is the centre of |Δn| of the first volume.
+    through: the voxel (z, y, x) in all sections; None is the centre of |Δn| of the first volume, or where little is
+        there, as between two beads, the middle of what is strongest.
     """
     through = through or _centre(next(iter(volumes.values())))
     top = max(float(v.max()) for v in volumes.values())
@@ -165,7 +172,7 @@ def draw_stack(
     """
     planes = np.unique(np.linspace(0, len(focus) - 1, min(len(focus), MOST_PLANES)).round().astype(int))
     aspect = stack.shape[2] * spacing[0] / (stack.shape[3] * spacing[1])
-    figure = Figure(figsize=(1.9 * len(planes) + 1.4, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
+    figure = Figure(figsize=(1.9 * len(planes) + 2.2, 1.9 * aspect * len(prisms) + 0.6), layout="constrained")
     axes = figure.subplots(len(prisms), len(planes), squeeze=False)
     for p, prism in enumerate(prisms):
         limits = _limits(stack[p])
@@ -176,7 +183,7 @@ def draw_stack(
         bar = figure.colorbar(axes[p, 0].images[0], ax=axes[p].tolist(), pad=0.01, aspect=12)
         bar.set_label("intensity", fontsize=8)
         bar.ax.tick_params(labelsize=7)
-        axes[p, 0].set_ylabel(_caption(prism), fontsize=8)
+        _name_row(axes[p, 0], prism)
         scale_bar(axes[p, 0], stack.shape[-1] * spacing[1], "white")
     return figure
 
@@ -233,7 +240,10 @@ def _place(grid: Grid, plane: str, through: tuple[int, int, int]) -> str:
 
 
 def _centre(volume: Tensor) -> tuple[int, int, int]:
-    """The voxel (z, y, x) at the |Δn|-weighted mean place; the middle one of an empty volume."""
+    """The voxel (z, y, x) at the |Δn|-weighted mean place; the middle one of an empty volume.
+
+    Where |Δn| there is below HOLLOW of the largest, it is the voxel whose surroundings have the largest mean.
+    """
     weight = volume.detach().abs()
     if float(weight.sum()) == 0:
         nz, ny, nx = volume.shape
@@ -243,10 +253,17 @@ def _centre(volume: Tensor) -> tuple[int, int, int]:
         profile = weight.sum([a for a in range(3) if a != axis])
         index = np.arange(len(profile))
         places.append(round(float((profile.cpu().numpy() * index).sum() / profile.sum().item())))
+    around = uniform_filter(weight.cpu().numpy(), AROUND)
+    if around[tuple(places)] < HOLLOW * around.max():
+        places = [int(index) for index in np.unravel_index(int(around.argmax()), around.shape)]
     return places[0], places[1], places[2]
 
 
-def _caption(prism: Prism | None) -> str:
-    if prism is None:
-        return "bright field"
-    return f"shear ({float(prism.shear[0]):g}, {float(prism.shear[1]):g}) µm\nbias {float(prism.bias):.3g} rad"
+def _name_row(ax: Axes, prism: Prism | None) -> None:
+    """Name a prism setting to the left of its images: the shear's length and its angle from right to down, the bias."""
+    words = "bright field"
+    if prism is not None:
+        y, x = (float(part) for part in prism.shear)
+        angle, bias = math.degrees(math.atan2(y, x)), math.degrees(float(prism.bias))
+        words = f"shear {math.hypot(y, x):.3g} µm\nat {angle:.3g}°\nbias {bias:.3g}°".replace("-", "−")
+    ax.set_ylabel(words, fontsize=8, rotation="horizontal", ha="right", va="center")
