@@ -279,7 +279,7 @@ def measured(recorded, config, tmp_path):
     return write
 
 
-def test_a_run_leaves_table_json_and_figure(config, tmp_path, capsys):
+def test_a_run_leaves_table_json_and_figure(config, tmp_path, capsys, monkeypatch):
     assert work_precision(config(BEAD, FEW, QUICK), tmp_path / "out") == 0
     found = kept(tmp_path / "out")
     assert found["complete"]
@@ -296,6 +296,13 @@ def test_a_run_leaves_table_json_and_figure(config, tmp_path, capsys):
     printed = capsys.readouterr()
     assert printed.out.count("| linear |") == 2
     assert "4/4" in printed.err
+
+    def made(*_):
+        raise AssertionError("a stack was made before the folder was looked at")
+
+    monkeypatch.setattr("recon.cli.fits._recorded", made)
+    assert work_precision(config(BEAD, FEW, QUICK), tmp_path / "out") == 2
+    assert "--restart" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -18,7 +18,7 @@ from recon.report.fit_fronts import draw_fits, fits_table
 from recon.report.fit_trial import FitCandidate
 from recon.run.data import load_data, prepared
 from recon.run.fits.finer import FinerModel
-from recon.run.fits.kept import KeptTrials
+from recon.run.fits.kept import EarlierTrials, KeptTrials
 from recon.run.fits.ladder import fits_of
 from recon.run.fits.trials import Recorded, fit_trials
 from recon.run.folder.prepared import prepare_folder
@@ -32,11 +32,11 @@ def run(options: argparse.Namespace) -> None:
     config = load(options.config)
     _check_pixels(config)
     candidates = fits_of(config)
+    earlier = EarlierTrials.within(options.out, resume=options.resume, restart=options.restart)
     recorded = _recorded(config, str(options.config), options.device)
+    kept = KeptTrials(options.out, recorded, earlier)
     prepare_folder(options.out)
     leave_resolved(config, options.out)
-    kept = KeptTrials(options.out, recorded)
-    kept.found(resume=options.resume, restart=options.restart)
     _try_each(recorded, candidates, kept)
     found = [trial for candidate in candidates for trial in kept.trials if trial.candidate == candidate]
     print(fits_table(found))

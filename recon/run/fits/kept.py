@@ -4,7 +4,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -21,40 +21,53 @@ from torchdic.files.whole import write_json
 FITS = "fits.json"
 
 
+@dataclass(frozen=True)
+class EarlierTrials:
+    """Trials that an earlier run has left. path: of their file. identity: of the configuration and the stack."""
+
+    path: Path
+    identity: str
+    trials: tuple[FitTrial, ...]
+
+    @classmethod
+    def within(cls, out: Path, *, resume: bool, restart: bool) -> "EarlierTrials | None":
+        """What an earlier run has left in a folder to go on from; None where there is nothing, or it is to be replaced.
+
+        Raises CheckpointError where the user must choose between both or the file can't be read, and FinishedError
+        where it holds all trials of a finished run.
+        """
+        path = out / FITS
+        if restart or not path.exists():
+            return None
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            complete, identity = bool(content["complete"]), str(content["identity"])
+            trials = [FitTrial(**{**row, "candidate": FitCandidate(**row["candidate"])}) for row in content["trials"]]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(f"{path}: holds no trials of this version: {error}; --restart replaces it") from error
+        if not resume:
+            if complete:
+                check_no_results(out, (FITS,), restart=False)
+            raise CheckpointError(
+                f"{path}: {len(trials)} fits of an interrupted run; go on with --resume or begin anew with --restart"
+            )
+        return cls(path, identity, tuple(trials))
+
+
 class KeptTrials:
     """The trials of one stack in a folder: fits.json and fits.csv, written anew after each.
 
     trials: those so far, in the order in which they were done.
     """
 
-    def __init__(self, out: Path, recorded: Recorded) -> None:
+    def __init__(self, out: Path, recorded: Recorded, earlier: EarlierTrials | None = None) -> None:
+        """Go on from earlier trials. Raises CheckpointError where they are another stack's or configuration's."""
         self.out, self.identity = out, _identity(recorded)
-        self.trials: list[FitTrial] = []
-
-    def found(self, *, resume: bool, restart: bool) -> None:
-        """Take over what an interrupted run has left.
-
-        Raises CheckpointError where the user must choose between both, the file can't be read, or it holds another
-        stack's or configuration's trials, and FinishedError where it holds all trials of a finished run.
-        """
-        path = self.out / FITS
-        if restart or not path.exists():
-            return
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-            complete, identity = bool(content["complete"]), content["identity"]
-            trials = [FitTrial(**{**row, "candidate": FitCandidate(**row["candidate"])}) for row in content["trials"]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(f"{path}: holds no trials of this version: {error}; --restart replaces it") from error
-        if not resume:
-            if complete:
-                check_no_results(self.out, (FITS,), restart=False)
+        if earlier is not None and earlier.identity != self.identity:
             raise CheckpointError(
-                f"{path}: {len(trials)} fits of an interrupted run; go on with --resume or begin anew with --restart"
+                f"{earlier.path}: holds fits of another configuration or stack; begin anew with --restart"
             )
-        if identity != self.identity:
-            raise CheckpointError(f"{path}: holds fits of another configuration or stack; begin anew with --restart")
-        self.trials = trials
+        self.trials = [] if earlier is None else list(earlier.trials)
 
     def missing(self, candidates: Sequence[FitCandidate]) -> list[FitCandidate]:
         """The candidates that haven't been tried."""
