@@ -130,6 +130,21 @@ def test_what_a_file_does_not_say_is_absent_or_recommended(write):
     assert config.data.flatten is None
 
 
+@pytest.mark.parametrize(
+    ("propagation", "typed", "method"),
+    [
+        ("wave", "", "newton"),
+        ("rays", "", "adam"),
+        ("projection", "[reconstruction]\nsteps = 7", "adam"),
+        ("rays", '[reconstruction]\nmethod = "newton"', "newton"),
+    ],
+)
+def test_the_method_is_the_one_that_suits_the_propagation(write, propagation, typed, method):
+    """Newton's Hessian is near the wave's: on rays Adam errs less (docs/reconstruction.md)."""
+    config = load(write(f'{CONTRACT}\n[fidelity]\npropagation = "{propagation}"\n{typed}'))
+    assert config.reconstruction.method == method
+
+
 def test_every_section_is_read(write):
     config = load(write(EVERYTHING))
     assert config.fidelity == Fidelity("rays", steps=7, sources=12, reference_plane=0.5)

@@ -4,8 +4,9 @@ import dataclasses
 import math
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from cattrs import transform_error
 from cattrs.errors import ForbiddenExtraKeysError
@@ -18,6 +19,7 @@ from recon.config.plausible.unlikely import degrees_in_radians, unlikely
 from recon.config.schema import Config, ConfigError, UnitsWarning, UnlikelyWarning
 from recon.config.spelling import FURTHER, canonical, unknown_key
 from torchdic.files.stack import FORMATS
+from torchdic.propagation.base import propagation_of
 
 T = TypeVar("T")
 
@@ -77,7 +79,19 @@ def _configuration(values: dict[str, Any], source: str) -> Config:
         values = canonical(values)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{source}: {error}") from error
-    return structure(values, Config, source)
+    config = structure(values, Config, source)
+    if "method" in values.get("reconstruction", {}):
+        return config
+    return replace(config, reconstruction=replace(config.reconstruction, method=_usual_method(config)))
+
+
+def _usual_method(config: Config) -> Literal["newton", "adam"]:
+    """The method that errs least with a configuration's propagation.
+
+    A weak specimen's Hessian is near the wave's. On rays Newton's method converges on few specimens, Adam on more.
+    """
+    fidelity = config.fidelity
+    return "newton" if fidelity is None or propagation_of(fidelity).spreads else "adam"
 
 
 def _warn_of_long_shears(config: Config, path: Path) -> None:
