@@ -37,7 +37,20 @@ ROOMS = (
     "tiff",
 )
 # recon's, likewise; data_synthetic stands beside them, and only the command line sees it.
-RECON = ("recording", "misfit", "prior", "fit", "earlier", "descend", "calibration", "config", "report", "run", "cli")
+RECON = (
+    "recording",
+    "misfit",
+    "prior",
+    "fit",
+    "earlier",
+    "descend",
+    "calibration",
+    "coverage",
+    "config",
+    "report",
+    "run",
+    "cli",
+)
 CONTRACT = {
     "Acquisition",
     "Camera",

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
+from recon.cli.evidence import coverage
 from recon.cli.own_stack import new, phase
 from recon.cli.own_stack.options import SEVERAL
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
@@ -66,6 +67,11 @@ COMMANDS = {
         "find the fastest way to compute images within a tolerance, and which effects matter",
         plan.run,
         (arguments.config, arguments.out_if_wanted, arguments.device),
+    ),
+    "coverage": Command(
+        "tell which frequencies of the index an acquisition sees, before it is recorded, and what would add to them",
+        coverage.run,
+        (arguments.config, arguments.out, coverage.arguments, arguments.restart),
     ),
     "calibrate": Command(
         "find signs, orders and values of the optics, as far as the images of a stack tell them",

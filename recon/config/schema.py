@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from recon.coverage.expected import ExpectedSpecimen
 from recon.fit.problem import DIRECT, STEPS, Recipe
 from torchdic import Acquisition, Candidate, Fidelity, Grid, Microscope, Prism
 from torchdic.fidelity import PROPAGATIONS
@@ -236,6 +237,11 @@ class CalibrationSection:
 
 
 @dataclass(frozen=True)
+class CoverageSection(ExpectedSpecimen):
+    """What `torchdic coverage` expects of a specimen beforehand; see `recon.coverage.expected.ExpectedSpecimen`."""
+
+
+@dataclass(frozen=True)
 class SimulationSection:
     """How to simulate.
 
@@ -291,7 +297,7 @@ class Config:
     volume, microscope, acquisition: the volume, the microscope, and what was recorded with it.
     data: the measured stack; None where there is none.
     fidelity: how carefully to compute; None lets the command choose.
-    reconstruction, calibration, simulation, work_precision: how the commands of these names work.
+    reconstruction, calibration, coverage, simulation, work_precision: how the commands of these names work.
     specimen: the kind and the measures of a known specimen, which `recon.cli` makes of it; None where there is none.
     tolerance: the error that images may have, for which a fidelity is planned, see `torchdic.plan`; None plans none.
     candidates: the ways to compute that `torchdic work-precision` compares; None takes those of
@@ -309,6 +315,7 @@ class Config:
     fidelity: Fidelity | None = None
     reconstruction: ReconstructionSection = field(default_factory=ReconstructionSection)
     calibration: CalibrationSection = field(default_factory=CalibrationSection)
+    coverage: CoverageSection = field(default_factory=CoverageSection)
     simulation: SimulationSection = field(default_factory=SimulationSection)
     specimen: dict[str, Any] | None = None
     tolerance: float | None = None

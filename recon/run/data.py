@@ -51,7 +51,7 @@ def prepared(config: Config, stack: Stack) -> Measured:
         pixel_size=pixels.spacing[1:],
         pixels=pixels.shape[1:],
         field=config.volume.grid.extent[1:] if pixels != config.volume.grid else None,
-        empty=tuple(_empty_field(config)),
+        empty=tuple(empty_levels(config)),
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
     check_counts(stack, expected)
@@ -142,7 +142,7 @@ def check_feasible(config: Config) -> None:
         raise ConfigError(f"{asks} {lacking}; {instead}")
 
 
-def _empty_field(config: Config) -> list[float]:
+def empty_levels(config: Config) -> list[float]:
     """Intensity that the model's empty volume has behind each prism, relative to the empty bright field.
 
     It is sin²(bias/2), and 1 in bright field, where the prisms' light does not leak and none is stopped. It is computed

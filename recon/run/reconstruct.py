@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.config.conversion import flat
-from recon.config.schema import CalibrationSection, Config, ConfigError, SimulationSection
+from recon.config.schema import CalibrationSection, Config, ConfigError, CoverageSection, SimulationSection
 from recon.earlier.direct import solved_directly
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.setup import Setup, empty_medium
@@ -134,6 +134,7 @@ def _identity(config: Config, measured: Measured, problem: Problem) -> str:
         data=None,  # what the descent sees of them is in their digest
         specimen=None,
         calibration=CalibrationSection(),
+        coverage=CoverageSection(),
         simulation=SimulationSection(),
         # with more steps it is the same one, prolonged
         reconstruction=replace(config.reconstruction, steps=None, checkpoint_every=1, support=None),

@@ -46,6 +46,32 @@ def weak_responses(setup: Setup, fidelity: Fidelity, like: Tensor) -> Complex[Te
     return T[..., : volume.grid.shape[2] // 2 + 1]
 
 
+def weak_curvature(
+    setup: Setup, weights: Float[Tensor, "prism focus"], fidelity: Fidelity, kept: int
+) -> tuple[Complex[Tensor, "y half low low"], Float[Tensor, "y half high"]]:
+    """Σ weight·conj(T)·T over the images: matrices of the lowest cosines along z, and the others' diagonals.
+
+    setup, fidelity: as for `weak_responses`; a camera's pixels count. weights: of each image. kept: number of cosines
+    that share a matrix.
+    """
+    grid = setup.volume.grid
+    along_z = cosines(grid.shape[0]).to(weights)
+    matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, kept, kept).to(weights.dtype.to_complex())
+    beyond = weights.new_zeros(*matrix.shape[:2], grid.shape[0] - kept)
+    for index, focus in enumerate(setup.acquisition.focus):
+        one = Acquisition(setup.acquisition.prisms, (number(focus),))
+        T = weak_responses(replace(setup, acquisition=one, brightness=None, drift=None), fidelity, weights)[:, 0]
+        T = T * weights[:, index].sqrt()[:, None, None, None]
+        camera = setup.microscope.camera
+        if camera is not None and not setup.sees_voxels:
+            T = T * camera.passed(grid.shape[1:], grid.spacing[1:], weights.dtype).to(weights.device)
+        T = T.permute(2, 3, 0, 1) @ along_z.mT.to(T.dtype)
+        low = T[..., :kept]
+        matrix += low.mH @ low
+        beyond += T[..., kept:].abs().square().sum(2)
+    return matrix, beyond
+
+
 class WeakHessian:
     """The Hessian of a misfit times the number of voxels, for the means that the priors are.
 
@@ -62,34 +88,12 @@ class WeakHessian:
         frequencies = grid.shape[1] * (grid.shape[2] // 2 + 1)
         each = 3 * frequencies * weights.element_size() * 2  # a matrix's entry, its inverse, and one to invert it
         self.kept = max(1, min(grid.shape[0], axial_band(setup), math.isqrt(memory // each)))
-
-        matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, self.kept, self.kept)
-        matrix = matrix.to(weights.dtype.to_complex())
-        beyond = weights.new_zeros(*matrix.shape[:2], grid.shape[0] - self.kept)
-        for index, focus in enumerate(setup.acquisition.focus):
-            T = self._responses(setup, focus, weights[:, index], fidelity)
-            low = T[..., : self.kept]
-            matrix += low.mH @ low
-            beyond += T[..., self.kept :].abs().square().sum(2)
+        matrix, beyond = weak_curvature(setup, weights, fidelity, self.kept)
         power = matrix.diagonal(dim1=-2, dim2=-1).real.sum() + beyond.sum()
         self.mean = float(power) / (frequencies * grid.shape[0])
         self._matrix, self._beyond = matrix, beyond + DAMPING * self.mean
         matrix.diagonal(dim1=-2, dim2=-1).add_(DAMPING * self.mean)
         self._differences = squared_differences(grid.shape, grid.spacing[2] / grid.spacing[0]).to(weights)
-
-    def _responses(
-        self, setup: Setup, focus: float | Tensor, weights: Float[Tensor, " prism"], fidelity: Fidelity
-    ) -> Complex[Tensor, "y half prism cosine"]:
-        """The images' responses at one focus to each cosine, times the roots of the images' weights."""
-        one = Acquisition(setup.acquisition.prisms, (number(focus),))
-        volume = setup.volume
-        T = weak_responses(replace(setup, acquisition=one, brightness=None, drift=None), fidelity, weights)[:, 0]
-        T = T * weights.sqrt()[:, None, None, None]
-        camera = setup.microscope.camera
-        if camera is not None and not setup.sees_voxels:
-            _, ny, nx = volume.grid.shape
-            T = T * camera.passed((ny, nx), volume.grid.spacing[1:], weights.dtype).to(weights.device)
-        return T.permute(2, 3, 0, 1) @ self._cosines.mT.to(T.dtype)
 
     def spectrum(self, delta: Float[Tensor, "z y x"]) -> Complex[Tensor, "y half cosine"]:
         """Δn in cosines along z and waves along y and x; orthonormal."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from recon.config.conversion import flat
-from recon.config.schema import SimulationSection, WorkPrecisionSection
+from recon.config.schema import CoverageSection, SimulationSection, WorkPrecisionSection
 from recon.report.fit_fronts import write_fits
 from recon.report.fit_trial import FitCandidate, FitTrial
 from recon.run.checkpoint import CheckpointError
@@ -99,6 +99,7 @@ def _identity(recorded: Recorded) -> str:
         recorded.config,
         data=None,  # what is fitted of them is in the digest
         specimen=None,
+        coverage=CoverageSection(),
         simulation=SimulationSection(),
         work_precision=WorkPrecisionSection(),
         candidates=None,

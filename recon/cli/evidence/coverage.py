@@ -1,0 +1,170 @@
+"""torchdic coverage: which frequencies of Δn an acquisition sees, before it is recorded, and what would add to them."""
+
+import argparse
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from recon.config.reading import load
+from recon.config.resolved import leave_resolved
+from recon.config.schema import Config, ConfigError
+from recon.coverage.acquisition import NoisyAcquisition, shot_noise
+from recon.coverage.changes import Change, changes
+from recon.coverage.figure import draw_coverage
+from recon.coverage.resolution import Resolution, finest_along_z, resolution_of
+from recon.coverage.seen import Coverage
+from recon.fit.newton.weak_hessian import lacks_of_linear_response
+from recon.report import figures
+from recon.run.data import empty_levels, load_data
+from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.results import check_no_results
+from torchdic.files.whole import write_json
+from torchdic.scalar import number
+
+RESULTS = "coverage.json"
+
+# Periods across z, in µm, for which the finest period along z is told.
+PERIODS = (0.5, 1.0, 2.0, 4.0)
+
+# A change that adds less than this share of what is seen, or takes less away, is called nothing.
+NOTHING = 0.02
+
+# A recording after which Δn is uncertain by more than this part of what it was before tells next to nothing.
+HARDLY = 0.9
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """What is asked for beside the coverage itself."""
+    parser.add_argument(
+        "--suggest", action="store_true", help="try single changes of the acquisition, and rank them by what they add"
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print what an acquisition sees, and leave it as coverage.json and coverage.png."""
+    check_no_results(options.out, (RESULTS,), restart=options.restart)
+    config = load(options.config)
+    recording, how = _recording(config, str(options.config))
+    prepare_folder(options.out)
+    expected = config.coverage
+    found = recording.coverage(expected)
+    resolution = resolution_of(found)
+    print(_words(found, resolution, recording, how))
+    ranked: list[tuple[Change, Coverage]] = []
+    if options.suggest:
+        tried = list(changes(recording))
+        covered = [change.recording.coverage(expected) for change in tqdm(tried, desc="changes", unit="change")]
+        ranked = sorted(zip(tried, covered, strict=True), key=lambda pair: -pair[1].number)
+        print("\n" + "\n".join(_suggestions(found, ranked)))
+    figures.save(draw_coverage(found, _axis(config)), options.out / "coverage.png")
+    write_json(options.out / RESULTS, _as_dict(found, resolution, recording, ranked))
+    leave_resolved(config, options.out)
+    print(f"\n{options.out / RESULTS} and coverage.png")
+
+
+def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
+    """The recording that a configuration plans or names, and where its noise is from."""
+    lacking = lacks_of_linear_response(config.microscope, config.acquisition)
+    if lacking is not None:
+        raise ConfigError(f"{source}: these images show nothing of a weak specimen: they need {lacking}")
+    camera = config.microscope.camera
+    photons = None if camera is None else camera.photons
+    recorded = config.data is not None and all(Path(file).exists() for file in config.data.files)
+    if config.data is not None and (recorded or photons is None):
+        noise, how = load_data(config).noise, "measured in the stack"
+        if noise is None:
+            raise ConfigError(f"{source}: the stack's noise can't be measured in images so small; give more pixels")
+    elif camera is not None and photons is not None:
+        levels, how = empty_levels(config), f"of {photons:g} photons per pixel of the bright field"
+        noise = [shot_noise(level, photons, camera.read_noise or 0.0) for level in levels]
+    else:
+        raise ConfigError(
+            f"{source}: missing key microscope.camera.photons or data.path: what images tell depends on their noise"
+        )
+    grid, background = config.volume.grid, config.volume.background
+    return NoisyAcquisition(grid, background, config.microscope, config.acquisition, tuple(noise)), how
+
+
+def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition, how: str) -> str:
+    """What was found, a line each."""
+    noise = sorted({f"{100 * level:.2g}" for level in recording.noise}, key=float)
+    rows = [
+        ("images", f"{len(recording.acquisition.prisms)} prism settings × {len(recording.focus)} planes"),
+        ("noise", f"{' to '.join(noise[:: max(1, len(noise) - 1)])} % of the bright field, {how}"),
+        ("seen", f"{found.share:.0%} of the frequencies that the apertures let through"),
+        (
+            "a point's width",
+            f"{resolution.finest:.2g} µm across z ({resolution.coarsest:.2g} µm along {resolution.direction:g}°), "
+            f"{resolution.axial:.2g} µm along z",
+        ),
+        ("Δn", f"known to ± {found.deviation:.2g}, before it ± {found.known_before:.2g}"),
+    ]
+    for period in PERIODS:
+        along = finest_along_z(found, period)
+        rows.append((f"{period:g} µm across z", _seen(along)))
+    width = max(len(name) for name, _ in rows)
+    lines = [f"  {name:<{width}}  {words}" for name, words in rows]
+    if found.deviation > HARDLY * found.known_before:
+        lines.append("these images tell next to nothing of such a specimen: what is found of it will be guessed")
+    return "\n".join(lines)
+
+
+def _seen(along: float | None) -> str:
+    """What is seen of gratings whose shortest period along z is `along`; see `finest_along_z`."""
+    if along is None:
+        return "isn't seen"
+    if math.isinf(along):
+        return "is seen where it doesn't change along z"
+    return f"is seen where it changes along z with periods of {along:.2g} µm or more"
+
+
+def _suggestions(found: Coverage, ranked: list[tuple[Change, Coverage]]) -> list[str]:
+    """What each change adds to what is seen, the most first."""
+    lines = ["single changes, by what they add to the frequencies that are seen:"]
+    for change, other in ranked:
+        gain, resolution = other.number / found.number - 1, resolution_of(other)
+        images = "" if math.isclose(change.images, 1) else f", {change.images:.3g} × the images"
+        adds = "next to nothing" if abs(gain) < NOTHING else f"{gain:+.0%}".replace("-", "−")
+        lines.append(
+            f"  {adds:>15}  {change.name}: {resolution.axial:.2g} µm along z, Δn ± {other.deviation:.2g}{images}"
+        )
+    return lines
+
+
+def _axis(config: Config) -> float:
+    """The first shear's axis, from right towards down, in rad; 0 in bright field."""
+    for prism in config.acquisition.prisms:
+        if prism is not None:
+            y, x = (number(part) for part in prism.shear)
+            return math.atan2(y, x)
+    return 0.0
+
+
+def _as_dict(
+    found: Coverage, resolution: Resolution, recording: NoisyAcquisition, ranked: list[tuple[Change, Coverage]]
+) -> dict[str, Any]:
+    """What was found as values that JSON can hold; what is infinite is None."""
+
+    def of(covered: Coverage, widths: Resolution) -> dict[str, Any]:
+        sizes = {name: value if math.isfinite(value) else None for name, value in asdict(widths).items()}
+        return {
+            "seen_share": covered.share,
+            "seen_number": covered.number,
+            "deviation": covered.deviation,
+            "deviation_before": covered.known_before,
+            "point_width_um": sizes,
+        }
+
+    along = {f"{period:g}": finest_along_z(found, period) for period in PERIODS}
+    return {
+        **of(found, resolution),
+        "finest_period_along_z_um": {name: value for name, value in along.items() if value != math.inf},
+        "noise": list(recording.noise),
+        "changes": [
+            {"change": change.name, "images": change.images, **of(other, resolution_of(other))}
+            for change, other in ranked
+        ],
+    }
