@@ -1,7 +1,9 @@
 """What an unknown specimen tells of the optics: values with which a volume that is fitted explains its images best.
 
-The direction of the shear and the condenser's aperture show so. The bias and the length of the shear don't: with other
-ones another Δn explains the images as well. Brightness and drift of each image show beside any volume.
+The direction of the shear and the condenser's aperture show so. Of bias b and length s of the shear their product
+s·cot(b/2) does, faintly: it is how strong the differential part of an image is beside the part that a bright field has
+too, which out of focus shows a specimen's Δn without any prism. Two settings tell the parts apart, one doesn't.
+Brightness and drift of each image show beside any volume.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,15 +36,19 @@ STEPS, SOURCES = 8, 18
 # The part of the priors' weight beside which brightness and drift are told.
 LIGHT = 0.25
 
-# Distance of the trials: of the shear's angle in rad, and of the logarithm of the condenser's NA.
-ANGLE, APERTURE = 0.12, 0.12
+# Of a fit that leaves little but noise: its steps, its condenser directions, and those of its drafts.
+CAREFUL = {"steps": 14, "sources": 72, "drafts": 32}
+
+# Distance of the trials: of the shear's angle in rad, of the logarithms of the condenser's NA and the shear's length.
+ANGLE, APERTURE, LENGTH = 0.12, 0.12, 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class Beside:
     """A part of a stack, and how a volume is fitted to it.
 
-    setup: an empty volume before the part. recipe: how to fit. noise: standard deviation of each prism's.
+    setup: an empty volume before the part. recipe: how to fit. noise: standard deviation of each prism's. weight: of
+    the priors; None follows the noise. steps, sources, drafts: of a fit, see `recon.calibration.trials.short_fits`.
     """
 
     part: Part
@@ -50,6 +56,9 @@ class Beside:
     recipe: Recipe
     noise: Sequence[float]
     weight: float | None = None
+    steps: int = STEPS
+    sources: int = SOURCES
+    drafts: int | None = None
 
     @property
     def misfit(self) -> GaussianMisfit:
@@ -63,7 +72,7 @@ class Beside:
 
     def held(self) -> "Beside":
         """The same with the priors' weight held at what it comes to now: trials differ by it else."""
-        weights = _last(self.problem(self.setup)).weights
+        weights = self.last(self.problem(self.setup)).weights
         return self if not weights else replace(self, weight=float(weights[-1]["tv"]))
 
     def problem(self, setup: Setup) -> Problem:
@@ -71,17 +80,28 @@ class Beside:
         recipe = self.recipe
         if self.weight is not None:
             recipe = recipe.held(self.weight)
-        fidelity, mask = Fidelity("wave", sources=SOURCES), self.part.mask
+        fidelity, mask = Fidelity("wave", sources=self.sources), self.part.mask
         return Problem.from_recipe(
             self.part.data, setup, fidelity, recipe, lambda data: GaussianMisfit(data, mask=mask), list(self.noise)
         )
 
+    def careful(self) -> "Beside":
+        """The same by fits that leave little but noise, with the priors' weight held at what it comes to."""
+        return replace(self, weight=None, **CAREFUL).held()
+
+    def last(self, problem: Problem) -> Step:
+        """The last step of a fit. Raises ValueError where the light can't be followed."""
+        last = last_step(problem, self.steps, self.sources, self.drafts)
+        if last is None:
+            raise ValueError("no volume can be fitted with these optics")
+        return last
+
     def misfits(self, setup: Setup) -> np.ndarray:
         """The misfit of each image, relative to its prism's spatial variance, after a fit."""
         problem = self.problem(setup)
-        last = _last(problem)
+        last = self.last(problem)
         with torch.no_grad():
-            images = with_values(problem.unknowns, last.values, setup).images(Fidelity("wave", sources=SOURCES))
+            images = with_values(problem.unknowns, last.values, setup).images(Fidelity("wave", sources=self.sources))
         misfit = problem.misfit
         squares = misfit.where_counted((images - misfit.data).square()) / misfit.variance
         return squares.mean((2, 3)).flatten().double().numpy()
@@ -129,6 +149,22 @@ def find_aperture(beside: Beside) -> Least:
     return beside.least("condenser's NA", changed, APERTURE, (-1.0, 0.7))
 
 
+def find_length(beside: Beside) -> Least:
+    """The logarithm of the shear's length over the declared one, of all settings alike, with the declared biases.
+
+    What the images tell is the product s·cot(b/2): where the bias was declared wrongly, the length makes up for it.
+    """
+    axes = axes_of(beside.setup.acquisition)
+    unknown = ShearOfAxes(axes)
+
+    def changed(logarithm: float) -> Setup:
+        entries = torch.zeros(max(axes) + 1, 2, dtype=torch.float64)
+        entries[:, 0] = logarithm
+        return unknown.put(unknown.of_entries(entries), beside.setup)
+
+    return beside.least("shear's length", changed, LENGTH, (-0.8, 0.8))
+
+
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Brightness (prism, focus) and drift (prism, focus, 2) in µm beside a volume, and their deviations, by name.
 
@@ -152,7 +188,7 @@ def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
 def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor], float | None]:
     """The parameters of brightness and drift, their deviations beside the volume, and the priors' last weight."""
     problem = beside.problem(beside.setup)
-    last = _last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
+    last = beside.last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
     index = next(u for u in problem.unknowns if u.name == "delta")
     unknowns = [Brightness(), Drift()]
     setup = index.put(last.values["delta"], beside.setup)
@@ -162,11 +198,3 @@ def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor],
     nearby = Nearby(unknowns, parameters, setup, fidelity)
     deviations = standard_deviations(nearby, parameters, problem.misfit)
     return parameters, deviations, float(last.weights[-1]["tv"]) if last.weights else None
-
-
-def _last(problem: Problem) -> Step:
-    """The last step of a fit. Raises ValueError where the light can't be followed."""
-    last = last_step(problem, STEPS, SOURCES)
-    if last is None:
-        raise ValueError("no volume can be fitted with these optics")
-    return last

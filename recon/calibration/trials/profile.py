@@ -26,13 +26,15 @@ class Least:
     """Where the misfit is least.
 
     value: there. deviation: one standard deviation; infinite where the misfit has no least. tried: the values of the
-    trials and their mean misfits. absorbed: the share of the noise that the best volume has absorbed.
+    trials and their mean misfits. absorbed: the share of the noise that the best volume has absorbed. unexplained: one
+    standard deviation more, where what no volume explains may hang on the value as what a volume absorbs does.
     """
 
     value: float
     deviation: float
     tried: tuple[tuple[float, float], ...]
     absorbed: float = 0.0
+    unexplained: float = 0.0
 
     @property
     def told(self) -> float:
@@ -80,8 +82,10 @@ def least_misfit(
         else:
             return Least(first, math.inf, _table(known))
         middle = least
-    absorbed = max(0.0, 1 - min(mean for _, mean in _table(known)) / noise) if noise > 0 else 0.0
-    return Least(least, _deviation(values, misfits, noise, pixels), _table(known), absorbed)
+    lowest, (curvature, _) = min(mean for _, mean in _table(known)), _parabola(values, misfits.mean(1))
+    absorbed = max(0.0, 1 - lowest / noise) if noise > 0 else 0.0
+    unexplained = math.sqrt(FREEDOM * max(0.0, lowest - noise) / curvature)
+    return Least(least, _deviation(values, misfits, noise, pixels), _table(known), absorbed, unexplained)
 
 
 def _deviation(values: Sequence[float], misfits: Float[np.ndarray, "trial image"], noise: float, pixels: int) -> float:

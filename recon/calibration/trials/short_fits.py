@@ -39,17 +39,20 @@ def short_fit(problem: Problem, steps: int = STEPS, sources: int = SOURCES) -> f
     return min((step.misfit for step in coarse_steps(problem, steps, sources)), default=math.inf)
 
 
-def last_step(problem: Problem, steps: int, sources: int) -> Step | None:
+def last_step(problem: Problem, steps: int, sources: int, drafts: int | None = None) -> Step | None:
     """The last step of a short fit; None where the light can't be followed."""
     last = None
-    for step in coarse_steps(problem, steps, sources):
+    for step in coarse_steps(problem, steps, sources, drafts):
         last = step
     return last
 
 
-def coarse_steps(problem: Problem, steps: int, sources: int) -> Iterator[Step]:
-    """The steps of a short fit; they end where the light can't be followed."""
-    coarse = GivenFidelity(Fidelity("wave", sources=sources), None)
+def coarse_steps(problem: Problem, steps: int, sources: int, drafts: int | None = None) -> Iterator[Step]:
+    """The steps of a short fit; they end where the light can't be followed.
+
+    sources: condenser directions. drafts: those of images that are corrected to these; None is all of them.
+    """
+    coarse = GivenFidelity(Fidelity("wave", sources=sources), drafts)
     with warnings.catch_warnings(), contextlib.suppress(FloatingPointError, UnstableError, SidewaysError):
         # what is warned of for a trial's aperture says nothing of the user's
         for kind in (SamplingWarning, WrapAroundWarning):

@@ -95,11 +95,7 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
         ("images", f"{len(recording.acquisition.prisms)} prism settings × {len(recording.focus)} planes"),
         ("noise", f"{' to '.join(noise[:: max(1, len(noise) - 1)])} % of the bright field, {how}"),
         ("seen", f"{found.share:.0%} of the frequencies that the apertures let through"),
-        (
-            "a point's width",
-            f"{resolution.finest:.2g} µm across z ({resolution.coarsest:.2g} µm along {resolution.direction:g}°), "
-            f"{resolution.axial:.2g} µm along z",
-        ),
+        ("a point's width", f"{_across(resolution)}, {resolution.axial:.2g} µm along z"),
         ("Δn", f"known to ± {found.deviation:.2g}, before it ± {found.known_before:.2g}"),
     ]
     for period in PERIODS:
@@ -110,6 +106,13 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
     if found.deviation > HARDLY * found.known_before:
         lines.append("these images tell next to nothing of such a specimen: what is found of it will be guessed")
     return "\n".join(lines)
+
+
+def _across(resolution: Resolution) -> str:
+    """How wide a point gets across z."""
+    finest, coarsest = (f"{width:.2g}" for width in (resolution.finest, resolution.coarsest))
+    worst = "" if finest == coarsest else f" ({coarsest} µm along {resolution.direction:g}°)"
+    return f"{finest} µm across z{worst}"
 
 
 def _seen(along: float | None) -> str:

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import torch
 
-from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images
+from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images, find_length
 from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
-from recon.run.calibration.found import DIRECTION, FoundQuantity, left, plain, rounded, rounded_shear
+from recon.run.calibration.found import DIRECTION, LENGTH, FoundQuantity, left, plain, rounded, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
 from torchdic import Acquisition
 from torchdic.scalar import number
@@ -18,23 +18,25 @@ from torchdic.scalar import number
 # Planes whose brightness and drift are looked at, at most.
 PLANES = 15
 
-# An angle, and an aperture's logarithm, that are as uncertain as this aren't told.
-UNSURE_ANGLE, UNSURE_APERTURE = math.radians(5), 0.1
+# An angle, and the logarithms of an aperture and a length, that are as uncertain as this aren't told.
+UNSURE_ANGLE, UNSURE_APERTURE, UNSURE_LENGTH = math.radians(5), 0.1, 0.15
 
 # Where the best volume leaves more than this many times what noise does, and this share of the contrast, what it
 # doesn't explain would be put down to the aperture.
 POOR, LEAST = 1.3, 0.03
 
-# What slabs, directions and priors move the aperture's logarithm and the angle by, as measured on known scenes.
-MODEL_APERTURE, MODEL_ANGLE = 0.05, math.radians(0.5)
+# What slabs, directions and priors move the logarithms of aperture and length and the angle by, as measured on known
+# scenes.
+MODEL_APERTURE, MODEL_LENGTH, MODEL_ANGLE = 0.05, 0.05, math.radians(0.5)
 
-# A value within so many standard deviations of what was told agrees with it.
-AGREES = 2.0
+# A value within so many standard deviations of what was told agrees with it. Little tells a length, and priors move it:
+# more is asked of it.
+AGREES, AGREES_LENGTH = 2.0, 3.0
 
 # A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
 SHOWS = 4.0
 
-SCALE = "it sets the scale of Δn: with an unknown specimen another Δn explains the images as well; use a bead"
+PRODUCT = "beside an unknown specimen the images tell no more than its product with the shear's length; use a bead"
 
 
 def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationStack, list[FoundQuantity]]:
@@ -43,25 +45,25 @@ def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationSt
     names = _untold(stack.config, known)
     if not can_be_tried(beside.problem(beside.setup)):
         why = "no prism has a linear response, without which no volume can be fitted beside it"
-        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na")] + names
-    print("the shear's direction and the condenser's aperture, by volumes that are fitted with several …", flush=True)
+        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na", LENGTH)] + names
+    print("the shear's direction, the condenser's aperture and the shear's length, by volumes fitted with several …")
     beside = beside.held()
     stack, angles = _angles(stack, beside)
     beside = replace(beside, setup=replace(beside.setup, acquisition=_of_part(stack, beside)))
     stack, aperture = _aperture(stack, beside)
+    stack, length = _length(stack)
     stack, images = _images(stack)
-    return stack, [angles, *aperture, *images, *names]
+    return stack, [angles, *aperture, length, *images, *names]
 
 
 def _untold(config: Config, known: set[str]) -> list[FoundQuantity]:
     """What an unknown specimen doesn't tell, and why."""
     prisms = [prism for prism in config.acquisition.prisms if prism is not None]
-    lengths = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in prisms]
-    found = [left("shear's length", "µm", lengths, SCALE)]
+    found: list[FoundQuantity] = []
     if not {"bias", "compensator's zero"} & known:
         several = len({round(abs(number(prism.bias)), 3) for prism in prisms}) > 1 or None in config.acquisition.prisms
         pairs = len(prisms) > 1
-        why = SCALE
+        why = PRODUCT
         if pairs and not config.calibration.one_exposure:
             told = "them" if several else "the compensator's zero"
             why += f"; if all settings had one exposure, calibration.one_exposure = true finds {told} from the levels"
@@ -127,6 +129,35 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
     microscope = replace(config.microscope, condenser=replace(condenser, na=na))
     quantity = FoundQuantity(name, "", before, na, sure, how)
     return stack.with_config(replace(config, microscope=microscope)), [quantity]
+
+
+def _length(stack: CalibrationStack) -> tuple[CalibrationStack, FoundQuantity]:
+    """The shear's length, of all settings alike, where two of them tell the differential part of an image."""
+    config = stack.config
+    prisms = [prism for prism in config.acquisition.prisms if prism is not None]
+    told = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in prisms]
+    if len(config.acquisition.prisms) < 2:
+        why = "one setting's images don't tell their differential part from a bright field's; use two, or a bead"
+        return stack, left(LENGTH, "µm", told, why)
+    beside = stack.beside().careful()
+    found = find_length(beside)
+    deviation = math.hypot(found.deviation, found.unexplained, MODEL_LENGTH)
+    if deviation > UNSURE_LENGTH:
+        why = "volumes explain the images as well with other lengths; use a bead"
+        return stack, left(LENGTH, "µm", told, why + _hidden([found], beside))
+    factor = math.exp(found.value)
+    values = [rounded(length * factor, 4) for length in told]
+    sure = [rounded(length * factor * deviation, 2) for length in told]
+    how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
+    if abs(found.value) < AGREES_LENGTH * deviation:
+        how += "; it agrees with what was told, which stays"
+        return stack, FoundQuantity(LENGTH, "µm", told, values, sure, how)
+    made = [
+        prism if prism is None else rounded_shear(replace(prism, shear=tuple(number(s) * factor for s in prism.shear)))
+        for prism in config.acquisition.prisms
+    ]
+    calibrated = replace(config, acquisition=replace(config.acquisition, prisms=made))
+    return stack.with_config(calibrated), FoundQuantity(LENGTH, "µm", told, values, sure, how)
 
 
 def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuantity]]:

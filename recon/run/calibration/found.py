@@ -16,6 +16,8 @@ from torchdic.scalar import number
 # The quantity that is a direction.
 DIRECTION = "shear's angle"
 
+LENGTH = "shear's length"
+
 # A value, or one for each prism, axis, image, …
 Value = Any
 
