@@ -153,6 +153,7 @@ def find_length(beside: Beside) -> Least:
     """The logarithm of the shear's length over the declared one, of all settings alike, with the declared biases.
 
     What the images tell is the product s·cot(b/2): where the bias was declared wrongly, the length makes up for it.
+    Where another length is found, it is sought once more beside it, because a wrong one gives the priors a wrong weight.
     """
     axes = axes_of(beside.setup.acquisition)
     unknown = ShearOfAxes(axes)
@@ -162,7 +163,12 @@ def find_length(beside: Beside) -> Least:
         entries[:, 0] = logarithm
         return unknown.put(unknown.of_entries(entries), beside.setup)
 
-    return beside.least("shear's length", changed, LENGTH, (-0.8, 0.8))
+    first = beside.careful().least("shear's length", changed, LENGTH, (-0.8, 0.8))
+    if abs(first.value) <= first.deviation:
+        return first
+    near = replace(beside, setup=changed(first.value)).careful()
+    again = near.least("shear's length", lambda more: changed(first.value + more), LENGTH / 2, (-0.4, 0.4))
+    return replace(again, value=first.value + again.value, tried=first.tried + again.tried)
 
 
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:

@@ -139,7 +139,7 @@ def _length(stack: CalibrationStack) -> tuple[CalibrationStack, FoundQuantity]:
     if len(config.acquisition.prisms) < 2:
         why = "one setting's images don't tell their differential part from a bright field's; use two, or a bead"
         return stack, left(LENGTH, "µm", told, why)
-    beside = stack.beside().careful()
+    beside = stack.beside()
     found = find_length(beside)
     deviation = math.hypot(found.deviation, found.unexplained, MODEL_LENGTH)
     if deviation > UNSURE_LENGTH:
