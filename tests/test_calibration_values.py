@@ -8,7 +8,7 @@ import torch
 
 import recon.calibration.known_specimen as known
 from data_synthetic import Bead
-from recon.calibration.beside_volume import Beside, find_angles, find_images
+from recon.calibration.beside_volume import Beside, find_angles, find_images, find_length
 from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
 from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.levels import biases_of_levels
@@ -264,6 +264,24 @@ def test_an_unknown_specimen_tells_the_shears_direction():
     error = found.value - math.atan2(0.06, 0.18)
     assert abs(error) < rad(3)
     assert abs(error) < 3 * max(found.deviation, rad(0.3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("longer", "more"), [(1.2, 0.0), (1.0, 8.0)], ids=["length", "bias"])
+def test_two_settings_tell_the_product_of_length_and_slope(longer, more):
+    """The length that makes s·cot(b/2) right, whether it was declared too long or the bias too large."""
+    place = Bead(1.2, 0.03, 1.4, (0.1, 0.3, -0.4))
+    true = Acquisition([Prism((0.06, 0.18), rad(b)) for b in (75, -75)], (-1.5, -0.5, 0.5, 1.5))
+    with torch.no_grad():
+        data = bead_images(true, 20000.0, 0, place, (32, 30))
+    shear = (0.06 * longer, 0.18 * longer)
+    told = Acquisition([Prism(shear, rad(b + math.copysign(more, b))) for b in (75, -75)], true.focus)
+    part = part_of(data, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
+    setup = part.setup(1.4, Microscope(0.546, Objective(0.8), Condenser(0.5)), told)
+    found = find_length(Beside(part, setup, Recipe(), [0.005, 0.005]))
+    expected = -math.log(longer) + math.log(math.tan(rad(75 + more) / 2) / math.tan(rad(75) / 2))
+    assert abs(found.value - expected) < 0.06
+    assert abs(found.value - expected) < 3 * math.hypot(found.deviation, found.unexplained)
 
 
 @pytest.mark.parametrize(("drift", "noise"), [(0.1, 0.004), (0.0, 0.02), (0.1, 0.02)])

@@ -168,7 +168,8 @@ def find_length(beside: Beside) -> Least:
         return first
     near = replace(beside, setup=changed(first.value)).careful()
     again = near.least("shear's length", lambda more: changed(first.value + more), LENGTH / 2, (-0.4, 0.4))
-    return replace(again, value=first.value + again.value, tried=first.tried + again.tried)
+    tried = tuple((first.value + more, misfit) for more, misfit in again.tried)
+    return replace(again, value=first.value + again.value, tried=first.tried + tried)
 
 
 def find_images(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
