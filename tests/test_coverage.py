@@ -30,6 +30,11 @@ ALONG_X, ALONG_Y = (0.0, 0.24), (0.24, 0.0)
 FIDELITY = Fidelity(sources=8)
 
 
+@pytest.fixture(autouse=True)
+def _few_directions(monkeypatch):
+    monkeypatch.setattr("recon.coverage.acquisition.DIRECTIONS", 12)
+
+
 def recording(prisms=((ALONG_X, 1.5),), focus=(-1.0, 0.0, 1.0), photons=4000.0, microscope=MICROSCOPE):
     noise = shot_noise(0.5, photons)
     acquisition = Acquisition([Prism(shear, bias) for shear, bias in prisms], focus)
@@ -232,6 +237,7 @@ def test_suggestions_are_ranked_by_what_they_add(covered, tmp_path):
     assert "a second shear axis, across the first" in out
 
 
+@pytest.mark.slow
 def test_a_sharper_expectation_changes_what_is_seen(covered, tmp_path):
     shares = []
     for contrast in (0.005, 0.05):

@@ -108,6 +108,7 @@ def test_path_lengths_are_left_in_µm_with_the_pixel_and_the_focus_step(write, t
 
 @OPL_SLOW
 @pytest.mark.usefixtures("no_pictures")
+@pytest.mark.slow
 def test_a_second_run_begins_anew_where_asked(write, tmp_path, method, capsys):
     path, out = write(method), tmp_path / "out"
     assert main(["reconstruct", str(path), "--out", str(out)]) == 0

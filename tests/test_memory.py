@@ -240,6 +240,7 @@ def test_no_scene_holds_more_than_what_spares_its_measurement(name, sources, spe
         assert room._peak(Batches(sources)) < ample
 
 
+@pytest.mark.slow
 def test_a_learned_lens_or_medium_is_kept_too(specimen):
     """Of lenses' matrices only where they are learned."""
     pupils = [JonesPupil({6: (torch.tensor(0.1, requires_grad=learned), 0.0)}) for learned in (False, True)]

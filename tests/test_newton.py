@@ -326,7 +326,7 @@ def by_pixels():
     "pixel",
     [
         pytest.param(0.2, id="twice", marks=SLOW),
-        pytest.param(0.15, id="1.5 times"),
+        pytest.param(0.15, id="1.5 times", marks=SLOW),
         pytest.param(0.1 / 1.5, id="1/1.5", marks=SLOW),
     ],
 )
@@ -384,6 +384,7 @@ def test_few_photons_do_not_stop_it():
     assert steps[-1].misfit < 0.95 * steps[0].misfit
 
 
+@pytest.mark.slow
 def test_hot_pixels_hardly_move_a_robust_fit(scene):
     delta, setup, data, _ = scene
     hot = data.clone()
