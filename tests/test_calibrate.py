@@ -96,7 +96,7 @@ def test_a_bead_leaves_a_microscope_to_be_reused(tmp_path, recorded, monkeypatch
 
 
 @pytest.mark.slow
-def test_an_unknown_specimen_tells_direction_and_leaves_what_sets_the_scale(tmp_path, recorded, monkeypatch, capsys):
+def test_an_unknown_specimen_tells_direction_and_length_and_leaves_the_bias(tmp_path, recorded, monkeypatch, capsys):
     assumed = ["bias", "shear's angle", "order of the planes", "sign of Δn"]
     told = {"assumed": assumed, "acquisition": {"focus": FOCUS[::-1], "prisms": prisms(0.2, 14, 1.3)}}
     config, record = calibrated(tmp_path, recorded, monkeypatch, told)
@@ -104,9 +104,10 @@ def test_an_unknown_specimen_tells_direction_and_leaves_what_sets_the_scale(tmp_
     assert [float(f) for f in config.acquisition.focus] == FOCUS
     assert config.assumed == ("bias", "sign of Δn")  # the others are found
     assert math.degrees(record["shear's angle"]["value"][0]) == pytest.approx(20, abs=3)
-    for name in ("shear's length", "bias"):
-        assert not record[name]["found"]
-        assert "scale of Δn" in record[name]["how"]
+    assert not record["bias"]["found"]
+    assert "its product with the shear's length" in record["bias"]["how"]
+    assert record["shear's length"]["found"]
+    assert record["shear's length"]["value"] == pytest.approx([0.2] * 2, rel=0.12)
     assert "gauge" in record["focus zero"]["how"]
     assert not (tmp_path / "out" / "microscope.toml").exists()
     said = capsys.readouterr().out

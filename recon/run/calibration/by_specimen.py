@@ -29,9 +29,9 @@ POOR, LEAST = 1.3, 0.03
 # scenes.
 MODEL_APERTURE, MODEL_LENGTH, MODEL_ANGLE = 0.05, 0.05, math.radians(0.5)
 
-# A value within so many standard deviations of what was told agrees with it. Little tells a length, and priors move it:
-# more is asked of it.
-AGREES, AGREES_LENGTH = 2.0, 3.0
+# A value within so many standard deviations of what was told agrees with it. Dim specimens tell little of aperture and
+# length, and priors move them: more is asked of them.
+AGREES_ANGLE, AGREES = 2.0, 3.0
 
 # A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
 SHOWS = 4.0
@@ -86,7 +86,7 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
     values = [rounded(t + least.value, 5) for t, least in zip(told, found, strict=True)]
     sure = [rounded(deviation, 2) for deviation in deviations]
     how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; from right towards down"
-    off = [abs(least.value) >= AGREES * deviation for least, deviation in zip(found, deviations, strict=True)]
+    off = [abs(least.value) >= AGREES_ANGLE * deviation for least, deviation in zip(found, deviations, strict=True)]
     if not any(off):
         how += "; it agrees with what was told, which stays"
         return stack, FoundQuantity(name, unit, told, values, sure, how)
@@ -149,7 +149,7 @@ def _length(stack: CalibrationStack) -> tuple[CalibrationStack, FoundQuantity]:
     values = [rounded(length * factor, 4) for length in told]
     sure = [rounded(length * factor * deviation, 2) for length in told]
     how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
-    if abs(found.value) < AGREES_LENGTH * deviation:
+    if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
         return stack, FoundQuantity(LENGTH, "µm", told, values, sure, how)
     made = [
