@@ -464,6 +464,14 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
         assert "dark" in line
 
 
+def test_a_simulation_is_replaced_by_another_one(write, run, tmp_path):
+    """It can be made again in seconds, unlike a stack that came from elsewhere (tests/test_folder.py)."""
+    assert run("simulate", write())[0] == 0
+    first = (tmp_path / "out" / "stack.ome.tif").read_bytes()
+    assert run("simulate", write({"microscope.objective.na": 0.6}))[0] == 0
+    assert (tmp_path / "out" / "stack.ome.tif").read_bytes() != first
+
+
 @pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")
 @pytest.mark.parametrize("more", [{}, pytest.param({"fidelity": ..., "tolerance": 0.3}, marks=pytest.mark.slow)])
 def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, more):

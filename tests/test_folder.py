@@ -17,6 +17,7 @@ LEAVES = {
     "phase": ("phase.json",),
     "calibrate": ("calibrated.toml", "calibration.json", "microscope.toml"),
     "work-precision": ("work_precision.json",),
+    "coverage": ("coverage.json",),
 }
 # Commands whose folder takes more than one look: what is interrupted goes on.
 RESUMED = {"reconstruct"}
