@@ -200,7 +200,7 @@ def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor],
     unknowns = [Brightness(), Drift()]
     setup = index.put(last.values["delta"], beside.setup)
     parameters = {"brightness": last.values["brightness"].log(), "drift": last.values["drift"]}
-    fidelity = Fidelity("wave", sources=SOURCES)
+    fidelity = Fidelity("wave", sources=beside.sources)
     parameters = refined(unknowns, parameters, setup, problem.misfit, fidelity)
     nearby = Nearby(unknowns, parameters, setup, fidelity)
     deviations = standard_deviations(nearby, parameters, problem.misfit)

@@ -23,7 +23,7 @@ class Change:
 
 
 def changes(recording: NoisyAcquisition) -> Iterator[Change]:
-    """The single changes that make sense: of prisms, planes, aperture and light; the last takes something away."""
+    """The single changes that make sense: of prisms, planes, aperture and light. One takes planes away."""
     for name, other in (*_of_prisms(recording), *_of_planes(recording), *_of_light(recording)):
         yield Change(name, other, _images(other) / _images(recording))
 

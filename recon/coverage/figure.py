@@ -3,15 +3,12 @@
 import math
 
 import numpy as np
-import torch
 from matplotlib.axes import Axes
 from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon.coverage.expected import lateral_frequencies
-from recon.coverage.resolution import middle
 from recon.coverage.seen import Coverage
 
 
@@ -34,7 +31,7 @@ def _draw_seen(ax: Axes, coverage: Coverage, angle: float):
     """The diagonal of R over frequencies across z, along an angle, and along z."""
     grid = coverage.grid
     highest = min(0.5 / d for d in grid.spacing[1:])
-    steps = np.linspace(-highest, highest, 2 * max(grid.shape[1:]) // 2 + 1)
+    steps = np.linspace(-highest, highest, max(grid.shape[1:]) + 1)
     columns = np.stack([_at(coverage, f * math.sin(angle), f * math.cos(angle)) for f in steps], 1)
     both = np.concatenate([columns[:0:-1], columns])
     axial = (len(columns) - 0.5) / (2 * grid.extent[0])
@@ -66,10 +63,8 @@ def _at(coverage: Coverage, y: float, x: float) -> NDArray[np.floating]:
 
 def _draw_point(figure: Figure, ax: Axes, coverage: Coverage) -> None:
     """A section along z through the estimate of a point."""
-    grid, place = coverage.grid, middle(coverage.grid)
-    point = torch.zeros(grid.shape, dtype=torch.float64)
-    point[place] = 1.0
-    section: Tensor = coverage.estimate(point)[:, place[1]]
+    grid, (response, place) = coverage.grid, coverage.estimate_of_point()
+    section = response[:, place[1]]
     largest = float(section.abs().max()) or 1.0
     half = 0.5 * min(grid.extent[2], grid.extent[0])
     size = 0.5 * grid.extent[2], 0.5 * grid.extent[0]

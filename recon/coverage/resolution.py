@@ -13,7 +13,6 @@ from torch import Tensor
 
 from recon.coverage.expected import lateral_frequencies
 from recon.coverage.seen import Coverage
-from torchdic import Grid
 
 # Angles across z at which a point's width is taken, in degrees.
 ANGLES = range(0, 180, 15)
@@ -37,17 +36,7 @@ class Resolution:
 
 def resolution_of(coverage: Coverage) -> Resolution:
     """The widths of the response to a point in the middle of the volume."""
-    grid = coverage.grid
-    point = torch.zeros(grid.shape, dtype=torch.float64)
-    place = middle(grid)
-    point[place] = 1.0
-    return widths(coverage.estimate(point), place, grid.spacing)
-
-
-def middle(grid: Grid) -> tuple[int, int, int]:
-    """The voxel in the middle of a grid."""
-    nz, ny, nx = grid.shape
-    return nz // 2, ny // 2, nx // 2
+    return widths(*coverage.estimate_of_point(), coverage.grid.spacing)
 
 
 def finest_along_z(coverage: Coverage, period: float) -> float | None:

@@ -84,6 +84,14 @@ class Coverage:
         spectrum = torch.cat([told, self.beyond * spectrum[..., low:]], -1).permute(2, 0, 1)
         return torch.tensordot(along_z.mT, torch.fft.irfft2(spectrum, s=self.grid.shape[1:]), 1)
 
+    def estimate_of_point(self) -> tuple[Float[Tensor, "z y x"], tuple[int, int, int]]:
+        """What the best linear estimate makes of a point in the middle of the volume, and the point's voxel."""
+        nz, ny, nx = self.grid.shape
+        place = nz // 2, ny // 2, nx // 2
+        point = torch.zeros(self.grid.shape, dtype=torch.float64)
+        point[place] = 1.0
+        return self.estimate(point), place
+
 
 def coverage(
     setup: Setup, noise: Float[Tensor, "prism focus"], fidelity: Fidelity, expected: ExpectedSpecimen

@@ -26,6 +26,9 @@ from torchdic.scalar import number
 
 RESULTS = "coverage.json"
 
+# A change, what its images tell, and how wide a point gets in them.
+Ranked = tuple[Change, Coverage, Resolution]
+
 # Periods across z, in µm, for which the finest period along z is told.
 PERIODS = (0.5, 1.0, 2.0, 4.0)
 
@@ -53,11 +56,12 @@ def run(options: argparse.Namespace) -> None:
     found = recording.coverage(expected)
     resolution = resolution_of(found)
     print(_words(found, resolution, recording, how))
-    ranked: list[tuple[Change, Coverage]] = []
+    ranked: list[Ranked] = []
     if options.suggest:
         tried = list(changes(recording))
         covered = [change.recording.coverage(expected) for change in tqdm(tried, desc="changes", unit="change")]
-        ranked = sorted(zip(tried, covered, strict=True), key=lambda pair: -pair[1].number)
+        widths = map(resolution_of, covered)
+        ranked = sorted(zip(tried, covered, widths, strict=True), key=lambda one: -one[1].number)
         print("\n" + "\n".join(_suggestions(found, ranked)))
     figures.save(draw_coverage(found, _axis(config)), options.out / "coverage.png")
     write_json(options.out / RESULTS, _as_dict(found, resolution, recording, ranked))
@@ -124,11 +128,11 @@ def _seen(along: float | None) -> str:
     return f"is seen where it changes along z with periods of {along:.2g} µm or more"
 
 
-def _suggestions(found: Coverage, ranked: list[tuple[Change, Coverage]]) -> list[str]:
+def _suggestions(found: Coverage, ranked: list[Ranked]) -> list[str]:
     """What each change adds to what is seen, the most first."""
     lines = ["single changes, by what they add to the frequencies that are seen:"]
-    for change, other in ranked:
-        gain, resolution = other.number / found.number - 1, resolution_of(other)
+    for change, other, resolution in ranked:
+        gain = other.number / found.number - 1
         images = "" if math.isclose(change.images, 1) else f", {change.images:.3g} × the images"
         adds = "next to nothing" if abs(gain) < NOTHING else f"{gain:+.0%}".replace("-", "−")
         lines.append(
@@ -147,7 +151,7 @@ def _axis(config: Config) -> float:
 
 
 def _as_dict(
-    found: Coverage, resolution: Resolution, recording: NoisyAcquisition, ranked: list[tuple[Change, Coverage]]
+    found: Coverage, resolution: Resolution, recording: NoisyAcquisition, ranked: list[Ranked]
 ) -> dict[str, Any]:
     """What was found as values that JSON can hold; what is infinite is None."""
 
@@ -167,7 +171,6 @@ def _as_dict(
         "finest_period_along_z_um": {name: value for name, value in along.items() if value != math.inf},
         "noise": list(recording.noise),
         "changes": [
-            {"change": change.name, "images": change.images, **of(other, resolution_of(other))}
-            for change, other in ranked
+            {"change": change.name, "images": change.images, **of(other, widths)} for change, other, widths in ranked
         ],
     }
