@@ -18,7 +18,7 @@ from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from recon.coverage.expected import ExpectedSpecimen, lateral_frequencies
-from recon.fit.newton.weak_hessian import axial_band, cosines, weak_curvature
+from recon.fit.newton.weak_hessian import axial_band, cosines, waves_of_columns, weak_curvature
 from recon.fit.setup import Setup
 from torchdic import Fidelity, Grid
 from torchdic.scalar import number
@@ -67,13 +67,7 @@ class Coverage:
 
     @property
     def _counts(self) -> Float[Tensor, " half"]:
-        """How many waves each column of a real FFT stands for."""
-        nx = self.grid.shape[2]
-        counts = torch.full((nx // 2 + 1,), 2.0, dtype=torch.float64)
-        counts[0] = 1
-        if nx % 2 == 0:
-            counts[-1] = 1
-        return counts
+        return waves_of_columns(self.grid.shape[2])
 
     def estimate(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
         """R·Δn: what the best linear estimate makes of a volume, but for noise."""

@@ -20,6 +20,7 @@ from torch import Tensor
 from recon.earlier.data import check_images, noise_of_prisms
 from recon.earlier.weight import Components, Rule, choose_weight
 from recon.fit.bounds import Bounds
+from recon.fit.newton.weak_hessian import waves_of_columns
 from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Fidelity, Grid
@@ -73,15 +74,8 @@ class LinearModel:
         return torch.fft.irfft2(spectrum, s=self.grid.shape[1:])
 
     def counts(self) -> Float[Tensor, " half"]:
-        """How many frequencies each column stands for: itself and, but for the first and the last of an even number,
-        its complex conjugate.
-        """
-        nx = self.grid.shape[2]
-        counts = torch.full((nx // 2 + 1,), 2.0, dtype=torch.float64, device=self.transfer.device)
-        counts[0] = 1
-        if nx % 2 == 0:
-            counts[-1] = 1
-        return counts
+        """How many frequencies each column stands for."""
+        return waves_of_columns(self.grid.shape[2]).to(self.transfer.device)
 
     def blocks(
         self, images: Float[Tensor, "image y x"]

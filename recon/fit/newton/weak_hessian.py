@@ -179,6 +179,17 @@ def cosines(number: int) -> Float[Tensor, "cosine z"]:
     return matrix
 
 
+def waves_of_columns(nx: int) -> Float[Tensor, " half"]:
+    """How many waves each column of a real FFT of nx pixels stands for: itself and its complex conjugate, but for the
+    first and, of an even number, the last; float64.
+    """
+    counts = torch.full((nx // 2 + 1,), 2.0, dtype=torch.float64)
+    counts[0] = 1
+    if nx % 2 == 0:
+        counts[-1] = 1
+    return counts
+
+
 def squared_differences(shape: tuple[int, int, int], ratio: float) -> Float[Tensor, "y half cosine"]:
     """DᵀD of the `forward_differences`, which is diagonal in waves along y and x and cosines along z; float64."""
     nz, ny, nx = shape
