@@ -18,7 +18,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 from unittest.mock import patch
@@ -40,7 +40,6 @@ from recon.fit.problem import Problem, Recipe, measured_noise
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference
-from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from recon.prior import edges
 from recon.recording.cut_field import needed_margin
@@ -57,8 +56,8 @@ from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Prism
 from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.files.format import Stack
 
-# Adam's learning rate where it goes on from a fit, and the distance in Δn from their bounds that voxels start with.
-RATE, ON_BOUNDS = 1e-4, 1e-5
+# Adam's learning rate where it goes on from a fit.
+RATE = 1e-4
 
 T = TypeVar("T")
 
@@ -229,22 +228,11 @@ def adam_from(found: Found, steps: int = 20) -> Found:
     problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe)
     index, *others = problem.unknowns
     assert isinstance(index, IndexDifference)
-    going_on = From(index.learning_rate, index.bounds, index.first, delta=found.last.delta)
+    going_on = replace(index, given=found.last.delta)
     began, last = time.process_time(), found.last
     for step in minimise(replace(problem, unknowns=[going_on, *others])):
         last = step
     return Found(scene, last, setup.within_field(last.delta), time.process_time() - began)
-
-
-@dataclass(frozen=True)
-class From(IndexDifference):
-    """Δn that starts from a given volume, delta."""
-
-    delta: Tensor = field(kw_only=True)
-
-    def start(self, setup: Setup, misfit: Misfit) -> Tensor:
-        """The given volume's parameter."""
-        return self.bounds.parameter(self.delta, margin=ON_BOUNDS)
 
 
 def nuisances(options: argparse.Namespace) -> None:

@@ -46,6 +46,7 @@ RECON = (
     "descend",
     "calibration",
     "coverage",
+    "evidence",
     "config",
     "report",
     "run",

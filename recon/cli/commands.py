@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from tqdm import tqdm
 
 from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
-from recon.cli.evidence import coverage
+from recon.cli.evidence import coverage, error_bars
 from recon.cli.own_stack import new, phase
 from recon.cli.own_stack.options import SEVERAL
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
@@ -82,6 +82,11 @@ COMMANDS = {
         "find the refractive-index volume behind a stack of DIC images",
         reconstruct.run,
         (arguments.config, arguments.out, arguments.device, arguments.earlier_run),
+    ),
+    "error-bars": Command(
+        "tell how far each voxel of a reconstruction, and the numbers of its parts, can be trusted",
+        error_bars.run,
+        (error_bars.arguments, arguments.device, arguments.restart),
     ),
     "work-precision": Command(
         "measure what accuracy costs: the error of images, or of reconstructions, against seconds and memory",

@@ -14,6 +14,7 @@ from recon.fit.nuisances.brightness import Brightness, RelativeBrightness
 from recon.fit.nuisances.named import NUISANCES
 from recon.fit.planned import GivenFidelity, PlannedFidelity
 from recon.fit.setup import Setup
+from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
@@ -161,6 +162,25 @@ class Problem:
             if isinstance(unknown, IndexDifference) and isinstance(unknown.bounds, SupportedBounds):
                 return unknown.bounds.support
         return None
+
+    def again(self, misfit: Misfit, last: Step, given: Tensor | None = None) -> "Problem":
+        """The problem of other images, to be solved as this one was in the end: with its last weight and fidelity.
+
+        misfit: holds the other images. last: step of this problem's descent. given: Δn (z, y, x) to start from, with
+        the priors' last weights; None starts anew.
+        Raises ValueError where the images' shape is another one.
+        """
+        index, *others = self.unknowns
+        priors, weight = self.priors, self.weight
+        if isinstance(index, IndexDifference):
+            index = replace(index, given=given)
+        if given is not None:
+            priors = [replace(p, first=p.last) if isinstance(p, Edges) else p for p in priors]
+        if weight is not None:
+            weight = replace(weight, first=last.weights[-1]["tv"], held=True)
+        careful = self.fidelity
+        fidelity = GivenFidelity(careful.last(last.plans), careful.draft_sources, careful.matrices)
+        return replace(self, misfit=misfit, unknowns=[index, *others], priors=priors, fidelity=fidelity, weight=weight)
 
     @classmethod
     def from_recipe(

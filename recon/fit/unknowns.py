@@ -7,7 +7,7 @@ and where in the model's setup the quantity goes. `Unknowns` are the unknowns of
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -21,8 +21,8 @@ from recon.misfit.base import Misfit
 from recon.prior.schedule import cosine
 from torchdic import Volume
 
-# Distance in Δn from its bounds that every voxel starts with.
-OFF_BOUNDS = 1e-3
+# Distance in Δn from its bounds that every voxel starts with; less where a descent goes on from a given volume.
+OFF_BOUNDS, OFF_BOUNDS_GIVEN = 1e-3, 1e-5
 
 # What goes on from one step to the next: of each unknown, by its name, the parameter and Adam's moments.
 State = dict[str, dict[str, Any]]
@@ -61,16 +61,20 @@ class IndexDifference(Unknown):
     """Δn of every voxel (z, y, x).
 
     learning_rate: Adam's first, in Δn. bounds: least and greatest Δn. first: "linear" starts from the weak specimen
-    that explains the data, see `recon.fit.start`; "zero" starts from the medium alone.
+    that explains the data, see `recon.fit.start`; "zero" starts from the medium alone. given: Δn (z, y, x) of the whole
+    volume, from which the descent starts in place of those, Newton's too; None is none.
     """
 
     learning_rate: float
     bounds: Bounds
     first: Literal["linear", "zero"]
+    given: Tensor | None = field(default=None, compare=False, repr=False)
     name = "delta"
 
     def start(self, setup: Setup, misfit: Misfit) -> Tensor:
         """The parameter of the first volume, OFF_BOUNDS away from the bounds."""
+        if self.given is not None:
+            return self.bounds.parameter(self.given, margin=OFF_BOUNDS_GIVEN)
         zero = misfit.data.new_zeros(()).expand(setup.volume.grid.shape)
         delta = _linear(setup, misfit) if self.first == "linear" else zero
         return self.bounds.parameter(delta, margin=OFF_BOUNDS)

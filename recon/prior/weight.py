@@ -65,12 +65,13 @@ class FollowsNoise:
 
     noise_misfit: what noise alone leaves of the misfit, as it was measured in the images; None where it wasn't: then
     the residual alone tells it. pixels: of all images, that count. first: the weight at first; None is chosen by the
-    specimen's contrast.
+    specimen's contrast. held: whether the weight stays as it is, as where other images are fitted in the same way.
     """
 
     noise_misfit: float | None
     pixels: int
     first: float | None = None
+    held: bool = False
 
     def aim(self, misfit: float, white: float, usual: float) -> float:
         """The misfit that is aimed at.
@@ -96,6 +97,8 @@ class FollowsNoise:
         """
         weights = [record["tv"] for record in past]
         weight = weights[-1]
+        if self.held:
+            return weight, "held"
         aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"

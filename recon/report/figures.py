@@ -85,7 +85,7 @@ def draw_images(
         for k, f in enumerate(planes):
             trio = axes[p, 3 * k : 3 * k + 3]
             for ax, (name, (stack, cmap, limits)) in zip(trio, kinds.items(), strict=True):
-                _show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
+                show(ax, stack[p, f], grid.spacing[1:], cmap, limits)
                 if p == 0:
                     ax.set_title(f"{name}\nfocus {float(focus[f]):g} µm", fontsize=8)
             scale_bar(trio[0], grid.extent[2], "white")
@@ -120,7 +120,7 @@ def draw_sections(
     through: the voxel (z, y, x) in all sections; None is the centre of |Δn| of the first volume, or where little is
         there, as between two beads, the middle of what is strongest.
     """
-    through = through or _centre(next(iter(volumes.values())))
+    through = through or centre(next(iter(volumes.values())))
     top = max(float(v.max()) for v in volumes.values())
     bottom = min(0.0, *(float(v.min()) for v in volumes.values()))
     size = dict(zip("zyx", grid.extent, strict=True))
@@ -136,7 +136,7 @@ def draw_sections(
         for ax, name in zip(column, planes, strict=True):
             section = {"xy": volume[through[0]], "xz": volume[:, through[1]], "yz": volume[:, :, through[2]]}[name]
             spacing = [grid.spacing["zyx".index(letter)] for letter in (name[1], name[0])]
-            shown = _show(ax, section, spacing, "viridis", (bottom, top))
+            shown = show(ax, section, spacing, "viridis", (bottom, top))
             ax.set_xlabel(name[0], fontsize=8, labelpad=1)
             ax.set_ylabel(name[1], fontsize=8, labelpad=1)
             ax.set_title(_place(grid, name, through), fontsize=7, loc="right", pad=2)
@@ -177,7 +177,7 @@ def draw_stack(
     for p, prism in enumerate(prisms):
         limits = _limits(stack[p])
         for ax, f in zip(axes[p], planes, strict=True):
-            _show(ax, stack[p, f], spacing, "gray", limits)
+            show(ax, stack[p, f], spacing, "gray", limits)
             if p == 0:
                 ax.set_title(f"focus {float(focus[f]):g} µm", fontsize=8)
         bar = figure.colorbar(axes[p, 0].images[0], ax=axes[p].tolist(), pad=0.01, aspect=12)
@@ -194,7 +194,8 @@ def _limits(images: Tensor) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: tuple[float, float]):
+def show(ax: Axes, image: Tensor, spacing: Sequence[float], cmap: str, limits: tuple[float, float]):
+    """Show an image (row, column) whose pixels have a spacing in µm, without ticks."""
     ny, nx = image.shape
     shown = ax.imshow(
         image.detach().cpu().numpy(),
@@ -239,7 +240,7 @@ def _place(grid: Grid, plane: str, through: tuple[int, int, int]) -> str:
     return f"{'zyx'[axis]} = {place:.3g} µm".replace("-", "−")
 
 
-def _centre(volume: Tensor) -> tuple[int, int, int]:
+def centre(volume: Tensor) -> tuple[int, int, int]:
     """The voxel (z, y, x) at the |Δn|-weighted mean place; the middle one of an empty volume.
 
     Where |Δn| there is below HOLLOW of the largest, it is the voxel whose surroundings have the largest mean.

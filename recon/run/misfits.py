@@ -21,7 +21,7 @@ def misfit_for(config: Config, measured: Measured) -> Callable[[Tensor], Misfit]
     Without a gain in [data], the Gaussian misfit goes by one noise for each prism, and the Poisson misfit by the gain
     that the stack shows. Pixels that don't count are masked. Raises ConfigError where the stack shows no gain.
     """
-    named, model, counted = config.reconstruction.misfit, _noise_model(config, measured), measured.left_out.counted
+    named, model, counted = config.reconstruction.misfit, noise_model(config, measured), measured.left_out.counted
 
     def mask(data: Tensor) -> Tensor | None:
         # the sample by which a descent's memory is foreseen has other pixels, of which all count
@@ -42,7 +42,7 @@ def misfit_for(config: Config, measured: Measured) -> Callable[[Tensor], Misfit]
     return lambda data: PoissonMisfit(data, model, mask(data))
 
 
-def _noise_model(config: Config, measured: Measured) -> NoiseModel | None:
+def noise_model(config: Config, measured: Measured) -> NoiseModel | None:
     """Shot and read noise in the unit of the prepared images, where the configuration gives the camera's gain."""
     section = config.data
     if section is None or section.gain is None:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +10,13 @@ import torch
 from torch import Tensor
 
 from recon.config.conversion import flat
+from recon.config.reading import load
+from recon.config.resolved import RESOLVED
 from recon.config.schema import CalibrationSection, Config, ConfigError, CoverageSection, SimulationSection
 from recon.earlier.direct import solved_directly
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.setup import Setup, empty_medium
+from recon.fit.step import Step
 from recon.misfit.base import Misfit
 from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
@@ -24,7 +27,7 @@ from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped
-from recon.run.results import INTERRUPTED, METRICS, Result, ResultsError, write_results
+from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
 from torchdic import Fidelity
 
@@ -84,6 +87,48 @@ def reconstruct(
     except STOPPING as error:  # the images by which the volume is judged have no room, or can't be followed
         error.args = (f"{error}; {leave_stopped(out, problem, ended)}",)
         raise
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """A finished reconstruction, read from its folder.
+
+    out: the folder. config, measured, problem: that were fitted. misfit: makes the problem's from images. step: the
+    last. identity: of all that the fit depends on.
+    """
+
+    out: Path
+    config: Config
+    measured: Measured
+    problem: Problem
+    misfit: Callable[[Tensor], Misfit]
+    step: Step
+    identity: str
+
+
+def reconstructed(out: Path, device: torch.device) -> Reconstructed:
+    """The reconstruction that a folder holds.
+
+    Raises ConfigError where the folder holds no finished one, and CheckpointError where its configuration or its data
+    have changed since, or its own misfit was one that only a script knows.
+    """
+    resolved = out / RESOLVED
+    if not (resolved.exists() and (out / VOLUME).exists()):
+        raise ConfigError(f"{out}: holds no finished reconstruction: {VOLUME} and {RESOLVED} are missing")
+    config = spelled_out(load(resolved))
+    measured = load_data(config)
+    data = torch.from_numpy(measured.data).to(device)
+    misfit = misfit_for(config, measured)
+    problem = problem_of(config, data, misfit, measured)
+    identity = _identity(config, measured, problem)
+    if config.reconstruction.method in DIRECT:
+        step, _ = solved_directly(config.reconstruction, problem, measured.noise)
+    elif (out / CHECKPOINT).exists():
+        step = checkpoint.load(out / CHECKPOINT, identity).step
+        step = replace(step, delta=step.delta.to(device))
+    else:
+        raise ConfigError(f"{out / CHECKPOINT}: missing: the fit can't be done again without it")
+    return Reconstructed(out, config, measured, problem, misfit, step, identity)
 
 
 def spelled_out(config: Config) -> Config:

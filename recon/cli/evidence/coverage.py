@@ -107,9 +107,14 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
         rows.append((f"{period:g} µm across z", _seen(along)))
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name:<{width}}  {words}" for name, words in rows]
-    if found.deviation > HARDLY * found.known_before:
+    if tells_nothing(found):
         lines.append("these images tell next to nothing of such a specimen: what is found of it will be guessed")
     return "\n".join(lines)
+
+
+def tells_nothing(found: Coverage) -> bool:
+    """Whether images leave Δn next to as uncertain as it was before them."""
+    return found.deviation > HARDLY * found.known_before
 
 
 def _across(resolution: Resolution) -> str:

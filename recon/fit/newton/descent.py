@@ -68,6 +68,11 @@ CREEP = 2e-3
 # Where a trial's light can't be followed, the trial is taken back.
 NO_IMAGES = (UnstableError, SidewaysError, TurnedRaysError)
 
+# Few directions mislead where their images err by more than this share of the images' variance, beyond what a weak
+# specimen's would, and by more than this share of what noise leaves: the specimen is so strong that a correction, which
+# holds at one volume, doesn't make their gradient that of all directions.
+ASTRAY, ABOVE_NOISE = 0.004, 0.1
+
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 2e-5, 0.01
 
@@ -79,9 +84,10 @@ class Place:
     delta: Δn (z, y, x). parameters: of the nuisances, by name. responding: those that the Hessian was made for, which a
     resumed descent makes again. split: of the last model. correction: of the draft images.
     weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
-    know it. width: of edges, over the last one. damping: λ over the Hessian's mean. accepted: number of steps that
-    were. before: the misfit one accepted step earlier. moved: whether the last step was accepted. still: accepted steps
-    in a row that changed next to nothing. pairs: for the secants. records: of the weight.
+    know it. width: of edges, over the last one. misled: whether few directions mislead here, so that each step has all.
+    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit one accepted step
+    earlier. moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
+    pairs: for the secants. records: of the weight.
     """
 
     delta: Float[Tensor, "z y x"]
@@ -93,6 +99,7 @@ class Place:
     scale: float
     known: bool = False
     width: float = WIDE
+    misled: bool = False
     damping: float = FIRST
     accepted: int = 0
     before: float | None = None
@@ -160,6 +167,8 @@ class _Descent:
             raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}; use method 'adam'")
         check_linear_response(problem.setup.microscope, problem.setup.acquisition)
         self.bounds = self.index.bounds
+        # a given volume is already as the many directions see it
+        self.coarse = COARSE_STEPS if self.index.given is None else 0
         grid = problem.setup.volume.grid
         self.ratio = grid.spacing[2] / grid.spacing[0]
         self.voxels = math.prod(grid.shape)
@@ -186,6 +195,8 @@ class _Descent:
                 elif hessian is None or now is None:
                     hessian = self.responses(place.responding, draft, exact)
                     now = self.judged(self.formed(place, draft))
+                if place.misled:  # that may have been found just now
+                    draft, exact, _ = self.drafted(place, number)
             except UnstableError as error:
                 raise FloatingPointError(f"the descent diverged at step {number + 1}: {error}") from error
             place = self.weighted(place, now, number)
@@ -206,14 +217,15 @@ class _Descent:
         fidelity = self.problem.fidelity
 
         def of(step: int) -> tuple[Fidelity, Fidelity | None]:
-            coarse = step < COARSE_STEPS
+            coarse = step < self.coarse
             careful = fidelity.coarse if coarse else fidelity.last(self.plans)
-            first, fine = drafts(careful, fidelity.draft_sources)
+            misled = place is not None and place.misled
+            first, fine = drafts(careful, None if misled else fidelity.draft_sources)
             return (first, None) if coarse else (fine, careful if careful != fine else None)
 
         before = None if place is None else of(number - 1)
         # however few steps there are, the fidelity that judges the volume is there in the end
-        if number >= min(COARSE_STEPS, self.problem.steps - 1):
+        if number >= min(self.coarse, self.problem.steps - 1):
             _, self.plans = fidelity.careful(number, self.placed(place), self.plans)
         draft, exact = of(number)
         return draft, exact, before is not None and before != (draft, exact)
@@ -277,17 +289,19 @@ class _Descent:
 
     def size(self, change: Float[Tensor, "prism focus row column"]) -> float:
         """The mean square of a change of images, relative to what noise leaves of it, or to a thousandth of all."""
-        misfit = self.problem.misfit
-        share = float((change.square().mean((1, 2, 3)) / misfit.variance.flatten()).mean())
         noise = self.problem.weight.noise_misfit if self.problem.weight is not None else None
-        return share / max(noise or 0.0, 1e-3)
+        return self.share(change) / max(noise or 0.0, 1e-3)
+
+    def share(self, change: Float[Tensor, "prism focus row column"]) -> float:
+        """The mean square of a change of images over the variance of the data."""
+        return float((change.square().mean((1, 2, 3)) / self.problem.misfit.variance.flatten()).mean())
 
     def lowest(self, delta: Float[Tensor, "z y x"]) -> float:
         """The least index of a volume."""
         return number_of(self.problem.setup.volume.background) + float(delta.min())
 
     def responses(self, parameters: dict[str, Tensor], draft: Fidelity, exact: Fidelity | None) -> WeakHessian:
-        """The weak specimen's Hessian for the directions of a draft; sets what these miss of the careful images.
+        """The weak specimen's Hessian for few directions; sets what a draft misses of the careful images.
 
         parameters: of the nuisances, by name. exact: the careful fidelity; None corrects nothing.
         The misfit's curvature is that at images without noise, nearly: each pixel is the mean of its neighbours.
@@ -303,7 +317,8 @@ class _Descent:
         room = MissedResponse.bytes_for(setup, weights.element_size()) <= memory
         if exact is not None and draft.sources < exact.sources and room:
             self.missed = MissedResponse(setup, draft, exact)
-        return WeakHessian(setup, weights, draft, memory)
+        few = min(draft.sources, self.problem.fidelity.draft_sources or draft.sources)
+        return WeakHessian(setup, weights, replace(draft, sources=few), memory)
 
     def priors(self, place: Place, number: int) -> list[tuple[float, Any]]:
         """The priors with their weights at a step, for the contrast that is known."""
@@ -324,26 +339,43 @@ class _Descent:
     # --- steps --------------------------------------------------------------------------------------------------------
 
     def start(self, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
-        """The empty volume, and the contrast and weight that a first linear estimate suggests."""
-        problem = self.problem
-        delta = self.bounds.clamped(problem.misfit.data.new_zeros(problem.setup.volume.grid.shape))
+        """The first place: the given volume; else the empty one, whose contrast a first linear estimate suggests."""
+        problem, given = self.problem, self.index.given
+        nothing = problem.misfit.data.new_zeros(problem.setup.volume.grid.shape)
+        delta = self.bounds.clamped(nothing if given is None else given.to(nothing))
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
         place = Place(delta, parameters, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
         place, hessian, now = self.turned(place, draft, exact)
+        if given is not None and (scale := contrast(delta)) > 0:
+            place = replace(place, scale=scale, weight=self.first_weight(scale), known=True, width=1.0)
+            return place, hessian, now
         inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
         linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
         scale = contrast(self.bounds.clamped(linear))
         scale = max(scale, contrast(linear) * 1e-3, 1e-9)
-        first = None if problem.weight is None else problem.weight.first
-        weight = first if first is not None else BEGUN / scale
-        return replace(place, scale=scale, weight=weight), hessian, now
+        return replace(place, scale=scale, weight=self.first_weight(scale)), hessian, now
+
+    def first_weight(self, scale: float) -> float:
+        """The priors' weight at first, for a specimen of a contrast."""
+        first = None if self.problem.weight is None else self.problem.weight.first
+        return first if first is not None else BEGUN / scale
 
     def turned(self, place: Place, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
         place = replace(place, pairs=(), correction=Correction(), before=None, responding=place.parameters)
         hessian = self.responses(place.responding, draft, exact)
         now, place = self.renewed(place, self.formed(place, draft), draft, exact)
+        if exact is not None and draft.sources < exact.sources and self.leads_astray(place.correction):
+            place, self.missed = replace(place, misled=True, correction=Correction()), None
+            _, draft = drafts(exact, None)
+            now, place = self.renewed(place, self.formed(place, draft), draft, exact if exact != draft else None)
         return place, hessian, now
+
+    def leads_astray(self, correction: Correction) -> bool:
+        """Whether a first correction says that few directions mislead."""
+        added = correction.added
+        assert added is not None
+        return self.share(added) > ASTRAY and self.size(added) > ABOVE_NOISE
 
     def weighted(self, place: Place, now: Judged, number: int) -> Place:
         """The place with the priors' contrast and weight for the next step."""
@@ -424,7 +456,7 @@ class _Descent:
 
     def ended(self, place: Place, number: int) -> bool:
         """Whether further steps would change nothing; the first careful one is always taken."""
-        return number > COARSE_STEPS and (place.still >= 2 or place.damping > MOST)
+        return number > self.coarse and (place.still >= 2 or place.damping > MOST)
 
     def steady(self, place: Place, number: int) -> bool:
         """Whether the priors' weights have all but stopped moving."""

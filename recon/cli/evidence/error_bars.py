@@ -1,0 +1,130 @@
+"""torchdic error-bars: how far each voxel of a reconstruction, and the numbers of its parts, can be trusted."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from recon.cli.evidence.coverage import tells_nothing
+from recon.config.schema import ConfigError
+from recon.evidence.regions import INCREMENT, Known
+from recon.run.evidence.error_bars import BIAS, DEVIATION, ERROR_BARS, ErrorBars, Wanted, error_bars
+from recon.run.reconstruct import Reconstructed, reconstructed
+from torchdic.files.stack import read_stack
+
+# A part by which numbers come out too large or too small in copies that is worth a word.
+WORTH_A_WORD = 0.03
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """The folder of the reconstruction, and what is asked for."""
+    usual = Wanted()
+    parser.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder of a finished reconstruction; results go there too"
+    )
+    parser.add_argument(
+        "--regions",
+        type=Path,
+        metavar="FILE",
+        help="labels of parts, as large as the volume: 0 is none, 1, 2, … are outlines drawn around parts",
+    )
+    parser.add_argument(
+        "--increment",
+        type=_positive,
+        default=INCREMENT,
+        metavar="ML_PER_G",
+        help=f"of the index with concentration, for dry mass (default: {INCREMENT:g} ml/g)",
+    )
+    parser.add_argument(
+        "--refits",
+        type=_number,
+        default=usual.noise,
+        metavar="N",
+        help=f"fits of other noise (default: {usual.noise})",
+    )
+    parser.add_argument(
+        "--copies",
+        type=_number,
+        default=usual.copies,
+        metavar="N",
+        help=f"fits of turned copies (default: {usual.copies})",
+    )
+
+
+def run(options: argparse.Namespace) -> None:
+    """Find the error bars of a reconstruction, print them, and leave them in its folder."""
+    done = reconstructed(options.folder, options.device)
+    outlines = dict(_outlines(options.regions, done)) if options.regions is not None else {}
+    wanted = Wanted(options.refits, options.copies, options.increment, outlines)
+    found = error_bars(done, wanted, restart=options.restart)
+    print("\n".join(_words(found, done.config.volume.background)))
+    print(f"\n{options.folder / ERROR_BARS}, {DEVIATION}, {BIAS} and error_bars.png")
+
+
+def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tensor, "z y x"]]]:
+    """The outlines of a file of labels, by name. Raises ConfigError where it isn't of the volume's shape or empty."""
+    labels, shape = read_stack(file).data, done.config.volume.shape
+    if labels.shape != (1, *shape):
+        given, ours = (
+            "×".join(map(str, sides)) for sides in (labels.shape[1:] if len(labels) == 1 else labels.shape, shape)
+        )
+        raise ConfigError(f"{file}: holds {given} labels, the volume {ours} voxels (z, y, x)")
+    numbers = [number for number in np.unique(labels) if number != 0]
+    if not numbers:
+        raise ConfigError(f"{file}: holds no label other than 0: there is no region to measure")
+    for number in numbers:
+        yield f"region {number:g}", torch.from_numpy(labels[0] == number)
+
+
+def _words(found: ErrorBars, background: float) -> Iterator[str]:
+    """What was found, a line each."""
+    deviation, bias, total = map(found.typical, (found.deviation, found.bias, found.total))
+    if not bool(found.delta.any()):
+        yield "the volume is empty: the images show nothing of a specimen, and there are no error bars of nothing"
+        return
+    yield (
+        f"Δn inside and near the specimen: ± {deviation:.2g} by noise, ± {bias:.2g} by what the images don't show, "
+        f"together ± {total:.2g}"
+    )
+    for name, (region, numbers) in found.regions.items():
+        volume, mean, mass = (numbers[quantity] for quantity in ("volume", "mean", "mass"))
+        above = "" if region.threshold is None else f", {_beyond(region.threshold)}"
+        yield f"{name}{above}:"
+        yield f"  volume      {_told(volume)} µm³{_usual(volume)}"
+        yield f"  mean index  {background + mean.value:.5f} ± {mean.error:.2g}{_usual(mean)}"
+        yield f"  dry mass    {_told(mass)} pg more than its medium{_usual(mass)}"
+    yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
+    if found.coverage is not None and tells_nothing(found.coverage):
+        yield "these images tell next to nothing of such a specimen: the volume is a guess of the priors'"
+
+
+def _beyond(threshold: float) -> str:
+    return f"Δn {'above' if threshold >= 0 else 'below'} {threshold:.3g}".replace("-", "−")
+
+
+def _told(known: Known) -> str:
+    return f"{known.value:.4g} ± {known.error:.2g}".replace("-", "−")
+
+
+def _usual(known: Known) -> str:
+    """By how much such a number comes out wrong as a rule, where it is worth a word."""
+    if abs(known.usual) < WORTH_A_WORD:
+        return ""
+    return f" (in turned copies {abs(known.usual):.0%} too {'large' if known.usual > 0 else 'small'})"
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (0 < value < float("inf")):
+        raise argparse.ArgumentTypeError(f"{text} must be above 0")
+    return value
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal() or int(text) < 2:
+        raise argparse.ArgumentTypeError(f"{text} must be a number of at least 2")
+    return int(text)

@@ -1,0 +1,69 @@
+"""A volume that was fitted, and how to fit the same again to other images."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.bounds import Bounds, SupportedBounds
+from recon.fit.problem import Problem
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference, with_values
+from recon.misfit.base import Misfit
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A volume that was fitted to images, and all that it takes to fit the same again to others.
+
+    problem: that was solved. step: its last. noise: standard deviation of each pixel (broadcastable) of given images
+    (prism, focus, y, x). misfit: makes one from images. solve: solves a problem.
+    """
+
+    problem: Problem
+    step: Step
+    noise: Callable[[Tensor], Tensor]
+    misfit: Callable[[Tensor], Misfit]
+    solve: Callable[[Problem], Step]
+
+    @property
+    def delta(self) -> Float[Tensor, "z y x"]:
+        """Δn of the whole volume, with its margin."""
+        return self.step.delta
+
+    @torch.no_grad()
+    def images(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "prism focus y x"]:
+        """The images of another Δn, with everything else as it was found."""
+        values = {**self.step.values, IndexDifference.name: delta}
+        known = {name: value.to(self.problem.misfit.data.device) for name, value in values.items()}
+        setup = with_values(self.problem.unknowns, known, self.problem.setup)
+        return setup.images(self.problem.fidelity.last(self.step.plans))
+
+    def recorded(self, images: Float[Tensor, "prism focus y x"], seed: int) -> Float[Tensor, "prism focus y x"]:
+        """The images with other noise of the same strength. seed: of the noise."""
+        drawn = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed))
+        return images + self.noise(images) * drawn.to(images)
+
+    def refitted(
+        self, images: Float[Tensor, "prism focus y x"], *, going_on: bool = False, anywhere: bool = False
+    ) -> Step:
+        """The fit of other images as that of the first ones was in the end.
+
+        going_on: start from this estimate; else anew. anywhere: without a support, where the specimen is another one.
+        """
+        newton = self.problem.method == "newton"  # what Adam ends with depends on the number of its steps
+        problem = self.problem.again(self.misfit(images), self.step, self.delta if going_on and newton else None)
+        return self.solve(_unsupported(problem) if anywhere else problem)
+
+
+def _unsupported(problem: Problem) -> Problem:
+    """The problem with Δn sought everywhere."""
+
+    def freed(unknown: object) -> object:
+        if isinstance(unknown, IndexDifference) and isinstance(unknown.bounds, SupportedBounds):
+            return replace(unknown, bounds=Bounds(unknown.bounds.lower, unknown.bounds.upper))
+        return unknown
+
+    return replace(problem, unknowns=[freed(unknown) for unknown in problem.unknowns])

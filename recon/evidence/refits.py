@@ -1,0 +1,62 @@
+"""Fits of other images than the measured ones, which tell how far a volume may be off.
+
+Noise: the estimate's own images with other noise are fitted in the same way. How these volumes differ is how the
+estimate would have differed with other noise (the parametric bootstrap: B. Efron and R. J. Tibshirani, An Introduction
+to the Bootstrap, Chapman & Hall 1993, 6.5). The estimate stands for the specimen.
+
+Bias: what the images don't see, the priors fill, and they fill it in the estimate already, whose own images a fit
+therefore explains by nearly the same volume. A copy that is turned has the estimate's well known sides where the images
+see little. It is known; its images are made, without noise, and fitted with the weight that the noise has asked for;
+how the fit differs from it is what is lost of such a specimen.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.evidence.estimate import Estimate
+from recon.evidence.turned import middle, turn, turned
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """A fit of other images.
+
+    kind: "noise", of the estimate itself with other noise; "turned", of a turned copy without. number: of its kind,
+    from 0.
+    delta: what was found. truth: what it was to find, of a turned copy; Δn (z, y, x), both within the field.
+    """
+
+    kind: Literal["noise", "turned"]
+    number: int
+    delta: Float[Tensor, "z y x"]
+    truth: Float[Tensor, "z y x"] | None = None
+
+
+def planned_refits(noise: int, copies: int) -> list[tuple[Literal["noise", "turned"], int]]:
+    """Kinds and numbers of so many refits, in the order in which they are done."""
+    return [*(("noise", number) for number in range(noise)), *(("turned", number) for number in range(copies))]
+
+
+def refits(estimate: Estimate, wanted: list[tuple[Literal["noise", "turned"], int]]) -> Iterator[Refit]:
+    """The refits that are wanted, one by one as they are done. Each depends on its kind and number alone."""
+    setup = estimate.problem.setup
+    own = estimate.images(estimate.delta) if any(kind == "noise" for kind, _ in wanted) else None
+    for kind, number in wanted:
+        if kind == "noise":
+            assert own is not None
+            step = estimate.refitted(estimate.recorded(own, number), going_on=True)
+            yield Refit(kind, number, setup.within_field(step.delta).cpu())
+            continue
+        truth = copy(estimate, number)
+        step = estimate.refitted(estimate.images(truth), anywhere=True)
+        yield Refit(kind, number, setup.within_field(step.delta).cpu(), setup.within_field(truth).cpu())
+
+
+def copy(estimate: Estimate, number: int) -> Float[Tensor, "z y x"]:
+    """The estimate, turned: a specimen of its kind. number: of the copy, from 0."""
+    delta = estimate.delta
+    return turned(delta, estimate.problem.setup.volume.grid, middle(delta), turn(number))

@@ -1,0 +1,135 @@
+"""The numbers that are asked for of a volume's parts: volume, mean index and dry mass, each with its error.
+
+Dry mass: a solution's index grows by the increment α with each g/ml of protein, α = 0.185 ml/g (R. Barer, J. Opt. Soc.
+Am. 47, 545, 1957; R. Barer and S. Joseph, Quart. J. Microsc. Sci. 95, 399, 1954), so that a region holds ΣΔn·dV/α
+more than as much of its medium. 1 g/ml is 1 pg/µm³.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from skimage.filters import threshold_otsu
+from torch import Tensor
+
+from recon.evidence.refits import Refit
+from torchdic import Grid
+
+# ml/g, of most proteins.
+INCREMENT = 0.185
+
+QUANTITIES = ("volume", "mean", "mass")
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A part of the volume: what lies above a threshold within an outline.
+
+    name: of it. outline: drawn around it, (z, y, x). threshold: in Δn; below 0, what lies below it; None is all of the
+    outline.
+    """
+
+    name: str
+    outline: Bool[Tensor, "z y x"]
+    threshold: float | None
+
+    @classmethod
+    def within(cls, name: str, outline: Bool[Tensor, "z y x"], delta: Float[Tensor, "z y x"]) -> "Region":
+        """The region that stands out in an outline, by Otsu's threshold between it and what is around it."""
+        values = delta[outline]
+        sign = -1.0 if float(values.sum()) < 0 else 1.0
+        flat = float(values.max()) == float(values.min())
+        threshold = None if flat else sign * float(threshold_otsu((sign * values).numpy()))
+        return cls(name, outline, threshold)
+
+    def voxels(self, delta: Float[Tensor, "z y x"], outline: Tensor | None = None) -> Bool[Tensor, "z y x"]:
+        """The region's voxels in a volume. outline: in place of the region's own, of a volume that is turned."""
+        within = self.outline if outline is None else outline
+        if self.threshold is None:
+            return within
+        return within & (delta > self.threshold if self.threshold >= 0 else delta < self.threshold)
+
+    def measures(
+        self, delta: Float[Tensor, "z y x"], grid: Grid, increment: float, outline: Tensor | None = None
+    ) -> dict[str, float]:
+        """Volume in µm³, mean Δn and dry mass in pg; the mean of nothing is 0. outline: as in `voxels`."""
+        there = self.voxels(delta, outline)
+        number, voxel = int(there.sum()), math.prod(grid.spacing)
+        total = float(delta[there].double().sum())
+        return {"volume": number * voxel, "mean": total / number if number else 0.0, "mass": total * voxel / increment}
+
+
+@dataclass(frozen=True)
+class Known:
+    """A number and how well it is known.
+
+    value: as it was found. noise: its standard deviation by noise. bias: by what else is lost. usual: by which part of
+    itself such a number comes out too large (or, below 0, too small) in copies of which the truth is known.
+    """
+
+    value: float
+    noise: float
+    bias: float
+    usual: float
+
+    @property
+    def error(self) -> float:
+        """Standard deviation of the whole error."""
+        return math.hypot(self.noise, self.bias)
+
+    def as_dict(self) -> dict[str, float]:
+        """For JSON."""
+        return {**asdict(self), "error": self.error}
+
+
+def known_measures(
+    region: Region,
+    delta: Float[Tensor, "z y x"],
+    grid: Grid,
+    increment: float,
+    refits: Sequence[Refit],
+    outlines: Mapping[int, Bool[Tensor, "z y x"]],
+) -> dict[str, Known]:
+    """The numbers of a region with their errors.
+
+    delta: the estimate. refits: of both kinds. outlines: the region's outline in each turned copy, by its number.
+    """
+    own = region.measures(delta, grid, increment)
+    noisy = [region.measures(refit.delta, grid, increment) for refit in refits if refit.kind == "noise"]
+    off: dict[str, list[float]] = {name: [] for name in QUANTITIES}
+    for refit in refits:
+        if refit.truth is None:
+            continue
+        outline = outlines[refit.number]
+        true = region.measures(refit.truth, grid, increment, outline)
+        found = region.measures(refit.delta, grid, increment, outline)
+        for name in QUANTITIES:
+            if true[name] != 0:
+                off[name].append(found[name] / true[name] - 1)
+    return {
+        name: Known(
+            own[name],
+            float(np.std([one[name] for one in noisy], ddof=1)) if len(noisy) > 1 else 0.0,
+            abs(own[name]) * math.sqrt(float(np.mean(np.square(off[name])))) if off[name] else 0.0,
+            float(np.mean(off[name])) if off[name] else 0.0,
+        )
+        for name in QUANTITIES
+    }
+
+
+def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], background: float) -> dict[str, Any]:
+    """Regions and their numbers as values that JSON can hold; the mean index is the medium's and Δn."""
+    found: dict[str, Any] = {}
+    for name, (region, numbers) in regions.items():
+        told = {quantity: known.as_dict() for quantity, known in numbers.items()}
+        index = told.pop("mean")
+        found[name] = {
+            "threshold": region.threshold,
+            "volume_um3": told["volume"],
+            "mean_index": {**index, "value": background + index["value"]},
+            "dry_mass_pg": told["mass"],
+        }
+    return found

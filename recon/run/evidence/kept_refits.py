@@ -1,0 +1,57 @@
+"""The refits of a volume in its folder: each is kept as soon as it is done, and serves again."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.evidence.refits import Refit
+from recon.run.checkpoint import CheckpointError
+from torchdic.files.whole import written_whole
+
+FOLDER, IDENTITY = "refits", "identity.txt"
+
+
+@dataclass(frozen=True)
+class KeptRefits:
+    """A folder with the volumes of refits, (z, y, x) as .npy. identity: of the estimate and its data, in one line."""
+
+    folder: Path
+    identity: str
+
+    def begin(self, *, restart: bool) -> None:
+        """Make the folder, and make sure that its refits are this estimate's.
+
+        restart: throw those of another one away. Raises CheckpointError where they are another one's.
+        """
+        told = self.folder / IDENTITY
+        if self.folder.exists() and (restart or not told.exists()):
+            shutil.rmtree(self.folder)
+        self.folder.mkdir(exist_ok=True)
+        if not told.exists():
+            with written_whole(told) as partial:
+                partial.write_text(self.identity, encoding="utf-8")
+        elif told.read_text(encoding="utf-8") != self.identity:
+            raise CheckpointError(f"{self.folder}: holds the refits of another volume; replace them with --restart")
+
+    def missing(
+        self, wanted: list[tuple[Literal["noise", "turned"], int]]
+    ) -> list[tuple[Literal["noise", "turned"], int]]:
+        """Those that have yet to be done."""
+        return [(kind, number) for kind, number in wanted if not self._file(kind, number).exists()]
+
+    def keep(self, refit: Refit) -> None:
+        """Keep the volume that a refit found. Raises WriteError."""
+        with written_whole(self._file(refit.kind, refit.number)) as partial, partial.open("wb") as file:
+            np.save(file, refit.delta.numpy())
+
+    def delta(self, kind: Literal["noise", "turned"], number: int) -> Tensor:
+        """The volume that a refit found."""
+        return torch.from_numpy(np.load(self._file(kind, number)))
+
+    def _file(self, kind: str, number: int) -> Path:
+        return self.folder / f"{kind}_{number:02d}.npy"
