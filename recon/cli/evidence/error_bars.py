@@ -11,8 +11,10 @@ from torch import Tensor
 
 from recon.cli.evidence.coverage import tells_nothing
 from recon.config.schema import ConfigError
+from recon.coverage.seen import Coverage
+from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
-from recon.run.evidence.error_bars import BIAS, DEVIATION, ERROR_BARS, ErrorBars, Wanted, error_bars
+from recon.run.evidence.error_bars import BIAS, DEVIATION, ERROR_BARS, Wanted, error_bars
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack
 
@@ -60,8 +62,8 @@ def run(options: argparse.Namespace) -> None:
     done = reconstructed(options.folder, options.device)
     outlines = dict(_outlines(options.regions, done)) if options.regions is not None else {}
     wanted = Wanted(options.refits, options.copies, options.increment, outlines)
-    found = error_bars(done, wanted, restart=options.restart)
-    print("\n".join(_words(found, done.config.volume.background)))
+    found, seen = error_bars(done, wanted, restart=options.restart)
+    print("\n".join(_words(found, seen, done.config.volume.background)))
     print(f"\n{options.folder / ERROR_BARS}, {DEVIATION}, {BIAS} and error_bars.png")
 
 
@@ -80,7 +82,7 @@ def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tenso
         yield f"region {number:g}", torch.from_numpy(labels[0] == number)
 
 
-def _words(found: ErrorBars, background: float) -> Iterator[str]:
+def _words(found: ErrorBars, seen: Coverage | None, background: float) -> Iterator[str]:
     """What was found, a line each."""
     deviation, bias, total = map(found.typical, (found.deviation, found.bias, found.total))
     if not bool(found.delta.any()):
@@ -98,7 +100,7 @@ def _words(found: ErrorBars, background: float) -> Iterator[str]:
         yield f"  mean index  {background + mean.value:.5f} ± {mean.error:.2g}{_usual(mean)}"
         yield f"  dry mass    {_told(mass)} pg more than its medium{_usual(mass)}"
     yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
-    if found.coverage is not None and tells_nothing(found.coverage):
+    if seen is not None and tells_nothing(seen):
         yield "these images tell next to nothing of such a specimen: the volume is a guess of the priors'"
 
 

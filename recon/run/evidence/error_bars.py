@@ -1,15 +1,13 @@
 """The error bars of a finished reconstruction, from its folder back into it."""
 
 import hashlib
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
@@ -17,11 +15,10 @@ from tqdm import tqdm
 from recon.coverage.acquisition import NoisyAcquisition
 from recon.coverage.seen import Coverage
 from recon.earlier.direct import solved_directly
-from recon.evidence.errors import LossModel, near, noise_deviation
+from recon.evidence.bars import ErrorBars, bars_of
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit, copy, planned_refits, refits
-from recon.evidence.regions import Known, Region, as_json, known_measures
-from recon.evidence.turned import middle, turn, turned
+from recon.evidence.regions import as_json
 from recon.fit.descent import minimise
 from recon.fit.newton.weak_hessian import responds_linearly
 from recon.fit.problem import DIRECT, Problem
@@ -34,7 +31,6 @@ from recon.run.evidence.kept_refits import FOLDER, KeptRefits
 from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
 from recon.run.reconstruct import Reconstructed
-from torchdic import Grid
 from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
@@ -59,35 +55,10 @@ class Wanted:
     outlines: Mapping[str, Bool[Tensor, "z y x"]] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorBars:
-    """What a volume's error bars are.
-
-    grid: of the volume. delta: Δn. deviation: its standard deviation by noise. bias: by what is lost besides; all
-    (z, y, x). regions: numbers of its parts. coverage: what the images see of such a specimen; None where they don't
-    respond to a weak one.
-    """
-
-    grid: Grid
-    delta: Float[Tensor, "z y x"]
-    deviation: Float[Tensor, "z y x"]
-    bias: Float[Tensor, "z y x"]
-    regions: Mapping[str, tuple[Region, Mapping[str, Known]]]
-    coverage: Coverage | None
-
-    @property
-    def total(self) -> Float[Tensor, "z y x"]:
-        """The standard deviation of the whole error."""
-        return torch.hypot(self.deviation, self.bias)
-
-    def typical(self, deviation: Float[Tensor, "z y x"]) -> float:
-        """Root mean square of a deviation inside and near the specimen; 0 of an empty volume."""
-        where = near(self.delta)
-        return math.sqrt(float(deviation[where].double().square().mean())) if bool(where.any()) else 0.0
-
-
-def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) -> ErrorBars:
+def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) -> tuple[ErrorBars, Coverage | None]:
     """Find the error bars of a reconstruction, and leave them in its folder.
+
+    Returns them, and what the images tell of a specimen of its contrast; None where they don't respond to a weak one.
 
     Its refits are kept there, and serve again. restart: do them anew.
     Raises CheckpointError where the folder has the refits of another volume, StackError where the noise isn't known,
@@ -108,9 +79,10 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
             f"interrupted; {left} of {len(planned)} refits are left to do: go on likewise"
         ) from None
     seconds = time.perf_counter() - began
-    found = _of_refits(done, estimate, [_kept(kept, estimate, *one) for one in planned], wanted)
-    _leave(found, out, wanted, seconds, done.config.volume.background)
-    return found
+    found = bars_of(estimate, [_kept(kept, estimate, *one) for one in planned], wanted.increment, wanted.outlines)
+    seen = _coverage(done, found.delta)
+    _leave(found, seen, done, wanted, seconds)
+    return found, seen
 
 
 def estimate_of(done: Reconstructed) -> Estimate:
@@ -155,39 +127,6 @@ def _kept(kept: KeptRefits, estimate: Estimate, kind: Any, number: int) -> Refit
     return Refit(kind, number, kept.delta(kind, number), truth)
 
 
-def _of_refits(done: Reconstructed, estimate: Estimate, found: Sequence[Refit], wanted: Wanted) -> ErrorBars:
-    """The error bars that refits tell."""
-    setup, grid = estimate.problem.setup, done.config.volume.grid
-    delta = setup.within_field(estimate.delta).cpu()
-    deviation = noise_deviation([refit.delta for refit in found if refit.kind == "noise"])
-    copies = [refit for refit in found if refit.kind == "turned"]
-    model = LossModel.of_copies(copies, grid, _finest(done))
-    bias = torch.zeros_like(delta) if model is None else model.deviation(delta)
-    outlines = {SPECIMEN: torch.ones(delta.shape, dtype=torch.bool), **(wanted.outlines or {})}
-    regions = {}
-    for name, outline in outlines.items():
-        region = Region.within(name, outline, delta)
-        moved = {refit.number: _turned_outline(estimate, outline, refit.number) for refit in copies}
-        regions[name] = region, known_measures(region, delta, grid, wanted.increment, found, moved)
-    return ErrorBars(grid, delta, deviation, bias, regions, _coverage(done, delta))
-
-
-def _turned_outline(estimate: Estimate, outline: Tensor, number: int) -> Tensor:
-    """An outline, turned as a copy is."""
-    setup = estimate.problem.setup
-    whole = F.pad(outline.float()[None], (setup.margin,) * 4, mode="replicate")[0]
-    moved = turned(whole, setup.volume.grid, middle(estimate.delta), turn(number), order=0)
-    return setup.within_field(moved) > 0
-
-
-def _finest(done: Reconstructed) -> float:
-    """The finest detail across z, λ/(NA of the objective and of the condenser) in µm."""
-    microscope, n0 = done.config.microscope, done.config.volume.background
-    lens = n0 if microscope.objective is None else microscope.objective.reach(n0)
-    light = 0.0 if microscope.condenser is None else min(microscope.condenser.na, n0)
-    return microscope.wavelength / (lens + light)
-
-
 def _coverage(done: Reconstructed, delta: Float[Tensor, "z y x"]) -> Coverage | None:
     """What the images tell of a specimen of this contrast."""
     config, noise = done.config, done.measured.noise
@@ -200,8 +139,11 @@ def _coverage(done: Reconstructed, delta: Float[Tensor, "z y x"]) -> Coverage | 
     return recording.coverage(replace(config.coverage, contrast=found) if found > 0 else config.coverage)
 
 
-def _leave(found: ErrorBars, out: Path, wanted: Wanted, seconds: float, background: float) -> None:
-    """Write the volumes, the figure and the numbers into a folder."""
+def _leave(
+    found: ErrorBars, seen: Coverage | None, out: Path, wanted: Wanted, seconds: float, background: float
+) -> None:
+    """Write the volumes, the figure and the numbers into the reconstruction's folder."""
+    out = done.out
     write_volume(out / DEVIATION, found.deviation, found.grid)
     write_volume(out / BIAS, found.bias, found.grid)
     figures.save(draw_error_bars(found.delta, found.deviation, found.bias, found.grid), out / "error_bars.png")
@@ -213,7 +155,7 @@ def _leave(found: ErrorBars, out: Path, wanted: Wanted, seconds: float, backgrou
             "bias": found.typical(found.bias),
             "total": found.typical(found.total),
         },
-        "seen_share": None if found.coverage is None else found.coverage.share,
-        "regions": as_json(found.regions, background),
+        "seen_share": None if seen is None else seen.share,
+        "regions": as_json(found.regions, done.config.volume.background),
     }
     write_json(out / ERROR_BARS, numbers)

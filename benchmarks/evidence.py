@@ -1,0 +1,205 @@
+"""Whether what is said of a volume holds: error bars against many draws of noise, and coverage against fits.
+
+    python benchmarks/evidence.py bars [SCENE ...]      # error bars and regions, over 20 draws of noise
+    python benchmarks/evidence.py extents               # stated and measured widths of points, on six acquisitions
+    python benchmarks/evidence.py gratings              # stated and measured transfer of gratings
+    python benchmarks/evidence.py prior                 # what isn't seen changes with the prior
+    python benchmarks/evidence.py suggestion            # a suggested change, carried out
+    python benchmarks/evidence.py nothing               # stacks that can't say anything
+
+The scenes are those of benchmarks/scenes.py: exact fields or a finer, different model, with noise.
+"""
+
+import argparse
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+import scenes
+from data_synthetic import CellPhantom, Ellipsoid
+from recon.evidence.bars import ErrorBars, bars_of
+from recon.evidence.errors import near
+from recon.evidence.estimate import Estimate
+from recon.evidence.refits import planned_refits, refits
+from recon.evidence.regions import INCREMENT
+from recon.fit.bounds import Bounds
+from recon.fit.descent import minimise
+from recon.fit.problem import Problem, Recipe, measured_noise
+from recon.fit.step import Step
+from recon.misfit.gaussian import GaussianMisfit
+from recon.run.reconstruct import RECOMMENDED
+from reconstruction import setup_of
+from scenes import Scene
+from torchdic import Camera
+from torchdic.errors import SamplingWarning, WrapAroundWarning
+
+# Draws of noise, and how many of them share the error bars of the first.
+DRAWS, SHARED = 20, 5
+
+# Refits of each: to other noise, and of turned copies.
+NOISE, COPIES = 16, 6
+
+# How much larger than a part of the cell its outline is drawn.
+LOOSELY = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """A scene with its noiseless images, of which noise can be drawn as often as one likes."""
+
+    scene: Scene
+    clean: Float[Tensor, "prism focus y x"]
+
+    @classmethod
+    def of(cls, name: str, cache: Path) -> "Draws":
+        """The draws of one of the scenes, which has noise."""
+        setup = scenes.SETUPS[name]()
+        return cls(setup.scene(name, cache), replace(setup, photons=None).scene(name, cache).data)
+
+    def data(self, seed: int) -> Float[Tensor, "prism focus y x"]:
+        """The images with noise. seed: of it."""
+        return Camera(photons=self.scene.photons).record(self.clean, torch.Generator().manual_seed(seed))
+
+    def estimate(self, data: Tensor) -> Estimate:
+        """The default fit of a draw."""
+        noise = measured_noise(data)
+        assert noise is not None
+        recipe = replace(Recipe(), bounds=Bounds(*self.scene.bounds))
+        problem = Problem.from_recipe(data, setup_of(replace(self.scene, data=data)), RECOMMENDED, recipe, noise=noise)
+        photons = self.scene.photons
+        assert photons is not None
+        return Estimate(problem, solved(problem), lambda images: (images / photons).sqrt(), GaussianMisfit, solved)
+
+
+def solved(problem: Problem) -> Step:
+    """The last step of a descent."""
+    *_, last = minimise(problem)
+    return last
+
+
+def header(*columns: str) -> None:
+    """Print a table's head."""
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
+
+
+def bars(options: argparse.Namespace) -> None:
+    """Error bars over draws of noise: what they hold, and how often a region's truth lies within two of its errors."""
+    header("scene", "noise's bar", "spread", "held by noise's bars", "whole bar", "error", "held by whole bars", "fits")
+    told: list[str] = []
+    for name in options.names or ("two beads", "cell", "bead"):
+        line, of_regions = _bars(name, options.cache)
+        print(line, flush=True)
+        told += of_regions
+    print()
+    header("scene", "region", "quantity", "truth", "first draw", "within one error", "within two")
+    print("\n".join(told))
+
+
+def _bars(name: str, cache: Path) -> tuple[str, list[str]]:
+    """A scene's line of the table, and those of its regions."""
+    draws = Draws.of(name, cache)
+    truth, outlines = draws.scene.truth, drawn_outlines(name, draws.scene)
+    where = near(truth)
+    spread, whole, sizes, errors, spreads, cost = [], [], [], [], [], []
+    within: dict[tuple[str, str], list[float]] = {}
+    first: dict[tuple[str, str], tuple[float, float, float]] = {}
+    for start in range(0, DRAWS, SHARED):
+        began = time.process_time()
+        estimate = draws.estimate(draws.data(100 + start))
+        of_fit = time.process_time() - began
+        found = bars_of(estimate, list(refits(estimate, planned_refits(NOISE, COPIES))), INCREMENT, outlines)
+        cost.append((time.process_time() - began) / of_fit - 1)
+        setup = estimate.problem.setup
+        noiseless = setup.within_field(estimate.refitted(draws.clean).delta)
+        for seed in range(100 + start, 100 + start + SHARED):
+            other = estimate if seed == 100 + start else draws.estimate(draws.data(seed))
+            delta = setup.within_field(other.delta)
+            spread.append(float(((delta - noiseless).abs() <= found.deviation)[where].float().mean()))
+            whole.append(float(((delta - truth).abs() <= found.total)[where].float().mean()))
+            spreads.append(float((delta - noiseless)[where].square().mean()))
+            errors.append(float((delta - truth)[where].square().mean()))
+            _count(within, first, found, delta, truth)
+        sizes.append((found.typical(found.deviation), found.typical(found.total)))
+    noise_bar, whole_bar = (sum(s[i] for s in sizes) / len(sizes) for i in (0, 1))
+    cells = (
+        name,
+        f"{noise_bar:.5f}",
+        f"{math.sqrt(sum(spreads) / DRAWS):.5f}",
+        f"{sum(spread) / DRAWS:.0%} ({min(spread):.0%} to {max(spread):.0%})",
+        f"{whole_bar:.5f}",
+        f"{math.sqrt(sum(errors) / DRAWS):.5f}",
+        f"{sum(whole) / DRAWS:.0%} ({min(whole):.0%} to {max(whole):.0%})",
+        f"{sum(cost) / len(cost):.1f}",
+    )
+    rows = []
+    for (region, quantity), ratios in within.items():
+        true, value, error = first[region, quantity]
+        one, two = (sum(abs(r) <= n for r in ratios) for n in (1, 2))
+        held = f"{one} of {len(ratios)} | {two} of {len(ratios)}"
+        rows.append(f"| {name} | {region} | {quantity} | {true:.4g} | {value:.4g} ± {error:.2g} | {held} |")
+    return "| " + " | ".join(cells) + " |", rows
+
+
+def _count(
+    within: dict[tuple[str, str], list[float]],
+    first: dict[tuple[str, str], tuple[float, float, float]],
+    found: ErrorBars,
+    delta: Tensor,
+    truth: Tensor,
+) -> None:
+    """Add by how many of its errors each region's numbers are off in one draw."""
+    for name, (region, numbers) in found.regions.items():
+        own = region.measures(delta, found.grid, INCREMENT)
+        true = region.measures(truth, found.grid, INCREMENT)
+        for quantity, known in numbers.items():
+            first.setdefault((name, quantity), (true[quantity], own[quantity], known.error))
+            within.setdefault((name, quantity), []).append((own[quantity] - true[quantity]) / known.error)
+
+
+def drawn_outlines(name: str, scene: Scene) -> Mapping[str, Bool[Tensor, "z y x"]]:
+    """Outlines that are drawn loosely around the cell's nucleus and droplet; none of other specimens."""
+    if not name.startswith("cell"):
+        return {}
+    cell = CellPhantom()
+    assert cell.nucleus is not None
+    assert cell.lipid is not None
+    parts = {"nucleus": cell.nucleus.shape, "droplet": cell.lipid.shape}
+    return {part: _outline(shape, scene) for part, shape in parts.items()}
+
+
+def _outline(shape: Ellipsoid, scene: Scene) -> Bool[Tensor, "z y x"]:
+    """The voxels within an ellipsoid that is LOOSELY larger."""
+    z, y, x = (scene.grid.coordinates(axis) for axis in range(3))
+    offsets = zip((z[:, None, None], y[:, None], x), shape.centre, shape.semi_axes, strict=True)
+    return sum(((place - middle) / (LOOSELY * half)).square() for place, middle, half in offsets) <= torch.ones(())
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {"bars": bars}
+
+
+def main() -> int:
+    """Print the chosen table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=COMMANDS)
+    parser.add_argument("names", nargs="*", help="scenes; those of the page without any")
+    parser.add_argument(
+        "--cache", type=Path, default=scenes.default_cache(), help="folder of the scenes' noiseless images"
+    )
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    for category in (SamplingWarning, WrapAroundWarning):
+        warnings.simplefilter("ignore", category)
+    COMMANDS[options.what](options)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

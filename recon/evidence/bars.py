@@ -1,0 +1,88 @@
+"""The error bars that refits tell: of each voxel, and of the numbers of a volume's parts."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from recon.evidence.errors import LossModel, near, noise_deviation
+from recon.evidence.estimate import Estimate
+from recon.evidence.refits import Refit
+from recon.evidence.regions import Known, Region, known_measures
+from recon.evidence.turned import middle, turn, turned
+from recon.fit.setup import Setup
+from torchdic import Grid
+from torchdic.scalar import number
+
+# The whole volume's own region.
+SPECIMEN = "specimen"
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBars:
+    """What a volume's error bars are.
+
+    grid: of the volume. delta: Δn. deviation: its standard deviation by noise. bias: by what is lost besides; all
+    (z, y, x). regions: its parts with their numbers, by name.
+    """
+
+    grid: Grid
+    delta: Float[Tensor, "z y x"]
+    deviation: Float[Tensor, "z y x"]
+    bias: Float[Tensor, "z y x"]
+    regions: Mapping[str, tuple[Region, Mapping[str, Known]]]
+
+    @property
+    def total(self) -> Float[Tensor, "z y x"]:
+        """The standard deviation of the whole error."""
+        return torch.hypot(self.deviation, self.bias)
+
+    def typical(self, deviation: Float[Tensor, "z y x"]) -> float:
+        """Root mean square of a deviation inside and near the specimen; 0 of an empty volume."""
+        where = near(self.delta)
+        return math.sqrt(float(deviation[where].double().square().mean())) if bool(where.any()) else 0.0
+
+
+def bars_of(
+    estimate: Estimate,
+    refits: Sequence[Refit],
+    increment: float,
+    outlines: Mapping[str, Bool[Tensor, "z y x"]] | None = None,
+) -> ErrorBars:
+    """The error bars that refits of an estimate tell.
+
+    increment: of the index with concentration, ml/g. outlines: drawn around parts of the field's volume, by name.
+    """
+    setup = estimate.problem.setup
+    grid, delta = setup.field, setup.within_field(estimate.delta).cpu()
+    deviation = noise_deviation([refit.delta for refit in refits if refit.kind == "noise"])
+    copies = [refit for refit in refits if refit.kind == "turned"]
+    model = LossModel.of_copies(copies, grid, _finest(setup))
+    bias = torch.zeros_like(delta) if model is None else model.deviation(delta)
+    drawn = {SPECIMEN: torch.ones(delta.shape, dtype=torch.bool), **(outlines or {})}
+    regions = {}
+    for name, outline in drawn.items():
+        region = Region.within(name, outline, delta)
+        moved = {refit.number: _turned_outline(estimate, outline, refit.number) for refit in copies}
+        regions[name] = region, known_measures(region, delta, grid, increment, refits, moved)
+    return ErrorBars(grid, delta, deviation, bias, regions)
+
+
+def _turned_outline(estimate: Estimate, outline: Bool[Tensor, "z y x"], copy: int) -> Bool[Tensor, "z y x"]:
+    """An outline, turned as a copy of that number is."""
+    setup = estimate.problem.setup
+    whole = F.pad(outline.float()[None], (setup.margin,) * 4, mode="replicate")[0]
+    moved = turned(whole, setup.volume.grid, middle(estimate.delta), turn(copy), order=0)
+    return setup.within_field(moved) > 0
+
+
+def _finest(setup: Setup) -> float:
+    """The finest detail across z, λ/(NA of the objective and of the condenser) in µm."""
+    microscope, n0 = setup.microscope, number(setup.volume.background)
+    lens = n0 if microscope.objective is None else microscope.objective.reach(n0)
+    light = 0.0 if microscope.condenser is None else min(microscope.condenser.na, n0)
+    return microscope.wavelength / (lens + light)
