@@ -470,6 +470,30 @@ def test_where_it_ends_the_volume_explains_the_data_by_careful_images():
     assert abs(draft - true) > 3 * abs(last.misfit - true)
 
 
+@pytest.mark.parametrize(("height", "misled"), [(0.2, True), pytest.param(0.01, False, marks=SLOW)])
+def test_few_directions_are_given_up_where_they_mislead(monkeypatch, height, misled):
+    """A correction that holds at one volume doesn't make few directions' gradient that of all."""
+    delta, careful = bead(height, radius=1.0), Fidelity(sources=72)
+    setup = setup_of(delta)
+    data, _ = recorded(setup, 0.1, careful)
+    steps = fitted(data, setup, Recipe(draft_sources=8), careful)
+    assert steps[-1].state["newton"]["misled"] is misled
+    if misled:
+        monkeypatch.setattr("recon.fit.newton.descent.ASTRAY", math.inf)
+        assert error(steps, delta) < 0.9 * error(fitted(data, setup, Recipe(draft_sources=8), careful), delta)
+
+
+def test_a_descent_goes_on_from_a_given_volume(scene, plain):
+    """Where it ended, the objective is as low already, by the weight and the contrast that were known in the end."""
+    delta, setup, data, noise = scene
+    problem = problem_of(data, setup, noise=noise)
+    steps = list(minimise(problem.again(problem.misfit, plain[-1], plain[-1].delta)))
+    assert steps[0].misfit == pytest.approx(plain[-1].misfit, rel=0.01)
+    assert steps[-1].loss < steps[0].loss * 1.001
+    assert {record["tv"] for record in steps[-1].weights} == {plain[-1].weights[-1]["tv"]}
+    assert error(steps, delta) == pytest.approx(error(plain, delta), rel=0.1)
+
+
 def test_the_careful_images_correct_from_the_fine_steps_on(scene, monkeypatch):
     """Not after 60 % of the steps: a descent may end before."""
     _, setup, data, _ = scene

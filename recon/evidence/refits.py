@@ -52,8 +52,9 @@ def refits(estimate: Estimate, wanted: list[tuple[Literal["noise", "turned"], in
             yield Refit(kind, number, setup.within_field(step.delta).cpu())
             continue
         truth = copy(estimate, number)
-        step = estimate.refitted(estimate.images(truth), anywhere=True)
-        yield Refit(kind, number, setup.within_field(step.delta).cpu(), setup.within_field(truth).cpu())
+        # images of nothing are uniform, and can't be fitted
+        found = estimate.refitted(estimate.images(truth), anywhere=True).delta if bool(truth.any()) else truth
+        yield Refit(kind, number, setup.within_field(found).cpu(), setup.within_field(truth).cpu())
 
 
 def copy(estimate: Estimate, number: int) -> Float[Tensor, "z y x"]:

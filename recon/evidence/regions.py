@@ -41,9 +41,9 @@ class Region:
         """The region that stands out in an outline, by Otsu's threshold between it and what is around it."""
         values = delta[outline]
         sign = -1.0 if float(values.sum()) < 0 else 1.0
-        flat = float(values.max()) == float(values.min())
-        threshold = None if flat else sign * float(threshold_otsu((sign * values).numpy()))
-        return cls(name, outline, threshold)
+        if float(values.max()) == float(values.min()):
+            return cls(name, outline, None if bool(values.any()) else 0.0)  # of nothing, nothing
+        return cls(name, outline, sign * float(threshold_otsu((sign * values).numpy())))
 
     def voxels(self, delta: Float[Tensor, "z y x"], outline: Tensor | None = None) -> Bool[Tensor, "z y x"]:
         """The region's voxels in a volume. outline: in place of the region's own, of a volume that is turned."""

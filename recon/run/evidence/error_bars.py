@@ -139,10 +139,9 @@ def _coverage(done: Reconstructed, delta: Float[Tensor, "z y x"]) -> Coverage | 
     return recording.coverage(replace(config.coverage, contrast=found) if found > 0 else config.coverage)
 
 
-def _leave(
-    found: ErrorBars, seen: Coverage | None, out: Path, wanted: Wanted, seconds: float, background: float
-) -> None:
+def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted: Wanted, seconds: float) -> None:
     """Write the volumes, the figure and the numbers into the reconstruction's folder."""
+    out = done.out
     out = done.out
     write_volume(out / DEVIATION, found.deviation, found.grid)
     write_volume(out / BIAS, found.bias, found.grid)
