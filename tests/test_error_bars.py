@@ -23,7 +23,7 @@ from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
-from torchdic.files.stack import read_volume, write_stack
+from torchdic.files.stack import read_volume
 
 BACKGROUND = 1.4
 GRID = Grid((8, 24, 20), (0.4, 0.2, 0.2))
@@ -163,11 +163,11 @@ def test_errors_of_numbers_are_those_of_the_refits():
     noisy = [Refit("noise", i, delta * factor) for i, factor in enumerate((0.99, 1.0, 1.01))]
     lost = [Refit("turned", i, delta * factor, delta) for i, factor in enumerate((0.9, 0.94))]
     found = known_measures(region, delta, GRID, 0.185, [*noisy, *lost], {0: outline, 1: outline})["mass"]
-    assert found.noise == pytest.approx(0.01 * found.value, rel=1e-4)
-    assert found.bias == pytest.approx(found.value * math.sqrt((0.1**2 + 0.06**2) / 2), rel=1e-4)
     assert found.usual == pytest.approx(-0.08, rel=1e-4)
-    assert found.error == pytest.approx(math.hypot(found.noise, found.bias))
-    assert Known(1.0, 0.3, 0.4, 0.0).error == pytest.approx(0.5)
+    assert found.value == pytest.approx(found.found / 0.92, rel=1e-4)
+    assert found.noise == pytest.approx(0.01 * found.value, rel=1e-4)
+    assert found.loss == pytest.approx(found.value * math.sqrt((0.1**2 + 0.06**2) / 2), rel=1e-4)
+    assert Known(1.0, 0.0, 0.3, 0.4).error == pytest.approx(0.5)
 
 
 # refits

@@ -15,7 +15,7 @@ from torchdic.scalar import number
 MOST_VOXELS = 64
 
 # Condenser directions.
-DIRECTIONS = 72
+DIRECTIONS = 128
 
 
 @dataclass(frozen=True, eq=False)

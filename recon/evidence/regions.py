@@ -23,6 +23,9 @@ INCREMENT = 0.185
 
 QUANTITIES = ("volume", "mean", "mass")
 
+# The largest part of a number that is believed to be lost.
+MOST_LOST = 0.5
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -66,23 +69,30 @@ class Region:
 class Known:
     """A number and how well it is known.
 
-    value: as it was found. noise: its standard deviation by noise. bias: by what else is lost. usual: by which part of
-    itself such a number comes out too large (or, below 0, too small) in copies of which the truth is known.
+    found: as it is in the estimate. usual: by which part of themselves such numbers come out too large (or, below 0,
+    too small) in copies of which the truth is known, on average. noise: its standard deviation by noise. loss: by what
+    else is lost, which scatters in the copies about nothing, not about their mean: half of what is lost may be lost
+    once more.
     """
 
-    value: float
-    noise: float
-    bias: float
+    found: float
     usual: float
+    noise: float
+    loss: float
+
+    @property
+    def value(self) -> float:
+        """The best estimate: the number without what such numbers usually lose or gain (a bootstrap's correction)."""
+        return self.found / (1 + self.usual)
 
     @property
     def error(self) -> float:
         """Standard deviation of the whole error."""
-        return math.hypot(self.noise, self.bias)
+        return math.hypot(self.noise, self.loss)
 
     def as_dict(self) -> dict[str, float]:
         """For JSON."""
-        return {**asdict(self), "error": self.error}
+        return {"value": self.value, "error": self.error, **asdict(self)}
 
 
 def known_measures(
@@ -109,15 +119,15 @@ def known_measures(
         for name in QUANTITIES:
             if true[name] != 0:
                 off[name].append(found[name] / true[name] - 1)
-    return {
-        name: Known(
-            own[name],
-            float(np.std([one[name] for one in noisy], ddof=1)) if len(noisy) > 1 else 0.0,
-            abs(own[name]) * math.sqrt(float(np.mean(np.square(off[name])))) if off[name] else 0.0,
-            float(np.mean(off[name])) if off[name] else 0.0,
-        )
-        for name in QUANTITIES
-    }
+    return {name: _known(own[name], [one[name] for one in noisy], off[name]) for name in QUANTITIES}
+
+
+def _known(found: float, noisy: Sequence[float], off: Sequence[float]) -> Known:
+    """A number that was found. noisy: in refits to other noise. off: by which parts it is off in copies."""
+    usual = max(float(np.mean(off)), -MOST_LOST) if off else 0.0
+    noise = float(np.std(noisy, ddof=1)) if len(noisy) > 1 else 0.0
+    loss = abs(found) * math.sqrt(float(np.mean(np.square(off)))) if off else 0.0
+    return Known(found, usual, noise / (1 + usual), loss / (1 + usual))
 
 
 def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], background: float) -> dict[str, Any]:
@@ -129,7 +139,7 @@ def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], backgroun
         found[name] = {
             "threshold": region.threshold,
             "volume_um3": told["volume"],
-            "mean_index": {**index, "value": background + index["value"]},
+            "mean_index": {**index, "value": background + index["value"], "found": background + index["found"]},
             "dry_mass_pg": told["mass"],
         }
     return found

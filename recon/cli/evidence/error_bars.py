@@ -18,9 +18,6 @@ from recon.run.evidence.error_bars import BIAS, DEVIATION, ERROR_BARS, Wanted, e
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack
 
-# A part by which numbers come out too large or too small in copies that is worth a word.
-WORTH_A_WORD = 0.03
-
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """The folder of the reconstruction, and what is asked for."""
@@ -96,9 +93,10 @@ def _words(found: ErrorBars, seen: Coverage | None, background: float) -> Iterat
         volume, mean, mass = (numbers[quantity] for quantity in ("volume", "mean", "mass"))
         above = "" if region.threshold is None else f", {_beyond(region.threshold)}"
         yield f"{name}{above}:"
-        yield f"  volume      {_told(volume)} µm³{_usual(volume)}"
-        yield f"  mean index  {background + mean.value:.5f} ± {mean.error:.2g}{_usual(mean)}"
-        yield f"  dry mass    {_told(mass)} pg more than its medium{_usual(mass)}"
+        yield f"  volume      {_told(volume)} µm³ ({volume.found:.4g} in the volume)"
+        yield f"  mean index  {background + mean.value:.5f} ± {mean.error:.2g} ({background + mean.found:.5f})"
+        yield f"  dry mass    {_told(mass)} pg more than its medium ({mass.found:.4g})".replace("-", "−")
+    yield "numbers are corrected for what turned copies lose of theirs; in brackets, as they are in the volume"
     yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
     if seen is not None and tells_nothing(seen):
         yield "these images tell next to nothing of such a specimen: the volume is a guess of the priors'"
@@ -110,13 +108,6 @@ def _beyond(threshold: float) -> str:
 
 def _told(known: Known) -> str:
     return f"{known.value:.4g} ± {known.error:.2g}".replace("-", "−")
-
-
-def _usual(known: Known) -> str:
-    """By how much such a number comes out wrong as a rule, where it is worth a word."""
-    if abs(known.usual) < WORTH_A_WORD:
-        return ""
-    return f" (in turned copies {abs(known.usual):.0%} too {'large' if known.usual > 0 else 'small'})"
 
 
 def _positive(text: str) -> float:
