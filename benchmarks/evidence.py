@@ -51,7 +51,7 @@ from torchdic.errors import SamplingWarning, WrapAroundWarning
 DRAWS, SHARED = 20, 5
 
 # Refits of each: to other noise, and of turned copies.
-NOISE, COPIES = 16, 6
+NOISE, COPIES = 16, 8
 
 # How much larger than a part of the cell its outline is drawn.
 LOOSELY = 1.3

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.cli import main
 from recon.evidence.bars import SPECIMEN, bars_of
-from recon.evidence.errors import LossModel, near, noise_deviation
+from recon.evidence.errors import ErrorModel, near, noise_deviation
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit, planned_refits, refits
 from recon.evidence.regions import Known, Region, known_measures
@@ -102,7 +102,7 @@ def test_bars_of_what_is_lost_hold_two_of_three_voxels():
         truth = ball(radius)
         return Refit(kind, number, blurred(truth, (1.0, 0.6, 0.6)), truth)
 
-    model = LossModel.of_copies([of("turned", 0.8), of("turned", 1.1, 1)], GRID, 0.42)
+    model = ErrorModel.of_copies([of("turned", 0.8), of("turned", 1.1, 1)], GRID, 0.42)
     assert model is not None
     unseen = of("turned", 0.95)
     assert unseen.truth is not None
@@ -114,8 +114,8 @@ def test_bars_of_what_is_lost_hold_two_of_three_voxels():
 
 def test_copies_that_are_found_exactly_leave_no_bars():
     exact = Refit("turned", 0, ball(), ball())
-    assert LossModel.of_copies([exact], GRID, 0.42) is None
-    assert LossModel.of_copies([], GRID, 0.42) is None
+    assert ErrorModel.of_copies([exact], GRID, 0.42) is None
+    assert ErrorModel.of_copies([], GRID, 0.42) is None
 
 
 # numbers of regions
@@ -166,8 +166,9 @@ def test_errors_of_numbers_are_those_of_the_refits():
     assert found.usual == pytest.approx(-0.08, rel=1e-4)
     assert found.value == pytest.approx(found.found / 0.92, rel=1e-4)
     assert found.noise == pytest.approx(0.01 * found.value, rel=1e-4)
-    assert found.loss == pytest.approx(found.value * math.sqrt((0.1**2 + 0.06**2) / 2), rel=1e-4)
-    assert Known(1.0, 0.0, 0.3, 0.4).error == pytest.approx(0.5)
+    assert found.error == pytest.approx(found.value * math.sqrt((0.1**2 + 0.06**2) / 2), rel=1e-4)
+    assert Known(1.0, 0.0, 0.3, 0.5).loss == pytest.approx(0.4)
+    assert Known(1.0, 0.0, 0.3, 0.2).error == pytest.approx(0.3)
 
 
 # refits
@@ -310,7 +311,7 @@ def done(folder):
 
 def test_it_leaves_volumes_a_figure_and_numbers(done):
     delta, grid = read_volume(done / "volume.ome.tif")
-    for name in ("sd.ome.tif", "bias.ome.tif"):
+    for name in ("sd.ome.tif", "error.ome.tif"):
         volume, same = read_volume(done / name)
         assert volume.shape == delta.shape
         assert same.spacing == pytest.approx(grid.spacing)

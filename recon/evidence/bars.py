@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from recon.evidence.errors import LossModel, near, noise_deviation
+from recon.evidence.errors import ErrorModel, near, noise_deviation
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit
 from recon.evidence.regions import Known, Region, known_measures
@@ -26,25 +26,25 @@ SPECIMEN = "specimen"
 class ErrorBars:
     """What a volume's error bars are.
 
-    grid: of the volume. delta: Δn. deviation: its standard deviation by noise. bias: by what is lost besides; all
-    (z, y, x). regions: its parts with their numbers, by name.
+    grid: of the volume. delta: Δn. deviation: its standard deviation by noise. total: that of its whole error, noise
+    and what is lost; all (z, y, x). regions: its parts with their numbers, by name.
     """
 
     grid: Grid
     delta: Float[Tensor, "z y x"]
     deviation: Float[Tensor, "z y x"]
-    bias: Float[Tensor, "z y x"]
+    total: Float[Tensor, "z y x"]
     regions: Mapping[str, tuple[Region, Mapping[str, Known]]]
-
-    @property
-    def total(self) -> Float[Tensor, "z y x"]:
-        """The standard deviation of the whole error."""
-        return torch.hypot(self.deviation, self.bias)
 
     def typical(self, deviation: Float[Tensor, "z y x"]) -> float:
         """Root mean square of a deviation inside and near the specimen; 0 of an empty volume."""
         where = near(self.delta)
         return math.sqrt(float(deviation[where].double().square().mean())) if bool(where.any()) else 0.0
+
+    @property
+    def lost(self) -> float:
+        """What is lost besides noise, root mean square inside and near the specimen."""
+        return math.sqrt(self.typical(self.total) ** 2 - self.typical(self.deviation) ** 2)
 
 
 def bars_of(
@@ -61,15 +61,15 @@ def bars_of(
     grid, delta = setup.field, setup.within_field(estimate.delta).cpu()
     deviation = noise_deviation([refit.delta for refit in refits if refit.kind == "noise"])
     copies = [refit for refit in refits if refit.kind == "turned"]
-    model = LossModel.of_copies(copies, grid, _finest(setup))
-    bias = torch.zeros_like(delta) if model is None else model.deviation(delta)
+    model = ErrorModel.of_copies(copies, grid, _finest(setup))
+    total = deviation if model is None else torch.maximum(model.deviation(delta), deviation)
     drawn = {SPECIMEN: torch.ones(delta.shape, dtype=torch.bool), **(outlines or {})}
     regions = {}
     for name, outline in drawn.items():
         region = Region.within(name, outline, delta)
         moved = {refit.number: _turned_outline(estimate, outline, refit.number) for refit in copies}
         regions[name] = region, known_measures(region, delta, grid, increment, refits, moved)
-    return ErrorBars(grid, delta, deviation, bias, regions)
+    return ErrorBars(grid, delta, deviation, total, regions)
 
 
 def _turned_outline(estimate: Estimate, outline: Bool[Tensor, "z y x"], copy: int) -> Bool[Tensor, "z y x"]:

@@ -1,13 +1,13 @@
-"""Error bars of each voxel: what the noise does, and what is lost besides, apart.
+"""Error bars of each voxel: of what the noise does, and of the whole error.
 
 Noise: the standard deviation of the refits to other noise. Of so few refits it is itself uncertain, by 1/√(2n), so each
 voxel's variance is averaged with those of its six neighbours.
 
-Bias: where the images say little, an estimate errs by how Δn changes from there to its neighbours: it blurs, rounds and
-draws out. So the squared error is taken as a sum of the estimate's local variances in windows of three sizes, and of
-Δn² (a contrast that is lost), with weights of at least 0 that explain the errors of the turned copies, of which the
-truth is known. A common factor then makes the bars hold 68 % of the copies' voxels (as in conformal prediction: G.
-Shafer and V. Vovk, J. Mach. Learn. Res. 9, 371, 2008).
+The whole error: where the images say little, an estimate errs by how Δn changes from a voxel to its neighbours: it
+blurs, rounds and draws out. So the squared error is taken as a sum of the estimate's local variances in windows of
+three sizes, and of Δn² (a contrast that is lost), with weights of at least 0 that explain the errors of the turned
+copies, of which the truth is known. A common factor then makes the bars hold 68 % of the copies' voxels (as in
+conformal prediction: G. Shafer and V. Vovk, J. Mach. Learn. Res. 9, 371, 2008).
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,8 @@ def noise_deviation(volumes: Sequence[Float[Tensor, "z y x"]]) -> Float[Tensor, 
 
 
 @dataclass(frozen=True, eq=False)
-class LossModel:
-    """How far an estimate's voxels would be off without noise, from how the estimate varies around them.
+class ErrorModel:
+    """How far an estimate's voxels are off, from how the estimate varies around them.
 
     grid: of the volumes. finest: length of the finest detail across z, µm. weights: of the local variances, and of Δn².
     """
@@ -64,7 +64,7 @@ class LossModel:
     weights: NDArray[np.floating]
 
     @classmethod
-    def of_copies(cls, copies: Sequence[Refit], grid: Grid, finest: float) -> "LossModel | None":
+    def of_copies(cls, copies: Sequence[Refit], grid: Grid, finest: float) -> "ErrorModel | None":
         """The model that explains the errors of turned copies; None where these hold nothing to learn from."""
         terms, squares = [], []
         for refit in copies:
@@ -85,7 +85,7 @@ class LossModel:
         return cls(grid, finest, weights * factor)
 
     def deviation(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "z y x"]:
-        """How far an estimate's voxels are off but for noise, as a standard deviation."""
+        """How far an estimate's voxels are off, as a standard deviation."""
         squares = np.tensordot(self.weights, _terms(delta, self.grid, self.finest), 1)
         return torch.from_numpy(np.sqrt(squares)).to(delta)
 

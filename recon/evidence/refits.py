@@ -4,10 +4,10 @@ Noise: the estimate's own images with other noise are fitted in the same way. Ho
 estimate would have differed with other noise (the parametric bootstrap: B. Efron and R. J. Tibshirani, An Introduction
 to the Bootstrap, Chapman & Hall 1993, 6.5). The estimate stands for the specimen.
 
-Bias: what the images don't see, the priors fill, and they fill it in the estimate already, whose own images a fit
-therefore explains by nearly the same volume. A copy that is turned has the estimate's well known sides where the images
-see little. It is known; its images are made, without noise, and fitted with the weight that the noise has asked for;
-how the fit differs from it is what is lost of such a specimen.
+What is lost: what the images don't see, the priors fill, and they fill it in the estimate already, whose own images a
+fit therefore explains by nearly the same volume. A copy that is turned has the estimate's well known sides where the
+images see little. It is known; it is recorded like the specimen, with noise, and fitted like it: how the fit differs
+from it is the whole error of such a fit.
 """
 
 from collections.abc import Iterator
@@ -20,13 +20,15 @@ from torch import Tensor
 from recon.evidence.estimate import Estimate
 from recon.evidence.turned import middle, turn, turned
 
+# Seeds of the noise: those of the copies begin here.
+SEEDS_OF_COPIES = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class Refit:
     """A fit of other images.
 
-    kind: "noise", of the estimate itself with other noise; "turned", of a turned copy without. number: of its kind,
-    from 0.
+    kind: "noise", of the estimate itself with other noise; "turned", of a turned copy. number: of its kind, from 0.
     delta: what was found. truth: what it was to find, of a turned copy; Δn (z, y, x), both within the field.
     """
 
@@ -52,9 +54,9 @@ def refits(estimate: Estimate, wanted: list[tuple[Literal["noise", "turned"], in
             yield Refit(kind, number, setup.within_field(step.delta).cpu())
             continue
         truth = copy(estimate, number)
-        # images of nothing are uniform, and can't be fitted
-        found = estimate.refitted(estimate.images(truth), anywhere=True).delta if bool(truth.any()) else truth
-        yield Refit(kind, number, setup.within_field(found).cpu(), setup.within_field(truth).cpu())
+        images = estimate.recorded(estimate.images(truth), SEEDS_OF_COPIES + number)
+        step = estimate.refitted(images, anywhere=True)
+        yield Refit(kind, number, setup.within_field(step.delta).cpu(), setup.within_field(truth).cpu())
 
 
 def copy(estimate: Estimate, number: int) -> Float[Tensor, "z y x"]:

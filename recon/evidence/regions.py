@@ -70,15 +70,15 @@ class Known:
     """A number and how well it is known.
 
     found: as it is in the estimate. usual: by which part of themselves such numbers come out too large (or, below 0,
-    too small) in copies of which the truth is known, on average. noise: its standard deviation by noise. loss: by what
-    else is lost, which scatters in the copies about nothing, not about their mean: half of what is lost may be lost
-    once more.
+    too small) in copies of which the truth is known, on average. noise: its standard deviation by noise. whole: that of
+    its whole error, as its copies' numbers scatter about nothing, not about their mean: of what the estimate has lost
+    already, its copies can't lose as much once more.
     """
 
     found: float
     usual: float
     noise: float
-    loss: float
+    whole: float
 
     @property
     def value(self) -> float:
@@ -87,12 +87,17 @@ class Known:
 
     @property
     def error(self) -> float:
-        """Standard deviation of the whole error."""
-        return math.hypot(self.noise, self.loss)
+        """Standard deviation of the error."""
+        return max(self.noise, self.whole)
+
+    @property
+    def loss(self) -> float:
+        """The error's part that isn't noise."""
+        return math.sqrt(self.error**2 - self.noise**2)
 
     def as_dict(self) -> dict[str, float]:
         """For JSON."""
-        return {"value": self.value, "error": self.error, **asdict(self)}
+        return {"value": self.value, "error": self.error, "loss": self.loss, **asdict(self)}
 
 
 def known_measures(
@@ -126,8 +131,8 @@ def _known(found: float, noisy: Sequence[float], off: Sequence[float]) -> Known:
     """A number that was found. noisy: in refits to other noise. off: by which parts it is off in copies."""
     usual = max(float(np.mean(off)), -MOST_LOST) if off else 0.0
     noise = float(np.std(noisy, ddof=1)) if len(noisy) > 1 else 0.0
-    loss = abs(found) * math.sqrt(float(np.mean(np.square(off)))) if off else 0.0
-    return Known(found, usual, noise / (1 + usual), loss / (1 + usual))
+    whole = abs(found) * math.sqrt(float(np.mean(np.square(off)))) if off else 0.0
+    return Known(found, usual, noise / (1 + usual), whole / (1 + usual))
 
 
 def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], background: float) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from recon.config.schema import ConfigError
 from recon.coverage.seen import Coverage
 from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
-from recon.run.evidence.error_bars import BIAS, DEVIATION, ERROR_BARS, Wanted, error_bars
+from recon.run.evidence.error_bars import DEVIATION, ERROR_BARS, TOTAL, Wanted, error_bars
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack
 
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
     wanted = Wanted(options.refits, options.copies, options.increment, outlines)
     found, seen = error_bars(done, wanted, restart=options.restart)
     print("\n".join(_words(found, seen, done.config.volume.background)))
-    print(f"\n{options.folder / ERROR_BARS}, {DEVIATION}, {BIAS} and error_bars.png")
+    print(f"\n{options.folder / ERROR_BARS}, {DEVIATION}, {TOTAL} and error_bars.png")
 
 
 def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tensor, "z y x"]]]:
@@ -81,14 +81,12 @@ def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tenso
 
 def _words(found: ErrorBars, seen: Coverage | None, background: float) -> Iterator[str]:
     """What was found, a line each."""
-    deviation, bias, total = map(found.typical, (found.deviation, found.bias, found.total))
+    noise, whole = map(found.typical, (found.deviation, found.total))
     if not bool(found.delta.any()):
         yield "the volume is empty: the images show nothing of a specimen, and there are no error bars of nothing"
         return
-    yield (
-        f"Δn inside and near the specimen: ± {deviation:.2g} by noise, ± {bias:.2g} by what the images don't show, "
-        f"together ± {total:.2g}"
-    )
+    parts = f"± {noise:.2g} by noise, ± {found.lost:.2g} by what is lost"
+    yield f"Δn inside and near the specimen: ± {whole:.2g}, of which {parts}"
     for name, (region, numbers) in found.regions.items():
         volume, mean, mass = (numbers[quantity] for quantity in ("volume", "mean", "mass"))
         above = "" if region.threshold is None else f", {_beyond(region.threshold)}"

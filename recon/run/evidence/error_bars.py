@@ -34,7 +34,7 @@ from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
 
-ERROR_BARS, DEVIATION, BIAS = "error_bars.json", "sd.ome.tif", "bias.ome.tif"
+ERROR_BARS, DEVIATION, TOTAL = "error_bars.json", "sd.ome.tif", "error.ome.tif"
 
 # The whole volume's own region.
 SPECIMEN = "specimen"
@@ -49,7 +49,7 @@ class Wanted:
     """
 
     noise: int = 16
-    copies: int = 6
+    copies: int = 8
     increment: float = 0.185
     outlines: Mapping[str, Bool[Tensor, "z y x"]] | None = None
 
@@ -143,15 +143,15 @@ def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted:
     out = done.out
     out = done.out
     write_volume(out / DEVIATION, found.deviation, found.grid)
-    write_volume(out / BIAS, found.bias, found.grid)
-    figures.save(draw_error_bars(found.delta, found.deviation, found.bias, found.grid), out / "error_bars.png")
+    write_volume(out / TOTAL, found.total, found.grid)
+    figures.save(draw_error_bars(found.delta, found.deviation, found.total, found.grid), out / "error_bars.png")
     numbers = {
         "refits": {"noise": wanted.noise, "turned": wanted.copies, "seconds": round(seconds, 3)},
         "increment_ml_per_g": wanted.increment,
         "inside_and_near": {
-            "deviation": found.typical(found.deviation),
-            "bias": found.typical(found.bias),
-            "total": found.typical(found.total),
+            "noise": found.typical(found.deviation),
+            "lost": found.lost,
+            "whole": found.typical(found.total),
         },
         "seen_share": None if seen is None else seen.share,
         "regions": as_json(found.regions, done.config.volume.background),

@@ -15,20 +15,20 @@ PLANES = ("xy", "xz")
 
 
 def draw_error_bars(
-    delta: Float[Tensor, "z y x"], deviation: Float[Tensor, "z y x"], bias: Float[Tensor, "z y x"], grid: Grid
+    delta: Float[Tensor, "z y x"], deviation: Float[Tensor, "z y x"], total: Float[Tensor, "z y x"], grid: Grid
 ) -> Figure:
-    """Draw an estimate, its standard deviation by noise, what is lost besides, and lines along x and z with both."""
+    """Draw an estimate, its standard deviation by noise and in all, and lines along x and z with both."""
     through = centre(delta)
     size = dict(zip("zyx", grid.extent, strict=True))
     heights = [size[plane[1]] for plane in PLANES]
     figure = Figure(figsize=(12.5, 2.3 * sum(heights) / size["x"] + 1.2), layout="constrained")
     axes = figure.subplots(2, 4, height_ratios=heights, width_ratios=(1, 1, 1, 1.25))
-    largest = max(float(deviation.max()), float(bias.max()), 1e-9)
+    largest = max(float(deviation.max()), float(total.max()), 1e-9)
     top, bottom = max(float(delta.max()), 1e-9), min(float(delta.min()), 0.0)
     columns = (
         ("Δn", delta, "viridis", (bottom, top)),
         ("± by noise", deviation, "magma", (0.0, largest)),
-        ("± by what is lost", bias, "magma", (0.0, largest)),
+        ("± in all", total, "magma", (0.0, largest)),
     )
     for column, (title, volume, colours, limits) in zip(axes.T, columns, strict=False):
         shown = None
@@ -40,20 +40,19 @@ def draw_error_bars(
             ax.set_ylabel(plane[1], fontsize=8, labelpad=1)
             scale_bar(ax, size[plane[0]], "white")
         column[0].set_title(title, fontsize=9)
-        if shown is not None and (volume is delta or volume is bias):
+        if shown is not None and (volume is delta or volume is total):
             bar = figure.colorbar(shown, ax=column, fraction=0.05, pad=0.02)
             bar.ax.tick_params(labelsize=7)
     along_x, along_z = (through[0], through[1], slice(None)), (slice(None), through[1], through[2])
-    _draw_line(axes[0, 3], "x", [v[along_x] for v in (delta, deviation, bias)], grid.spacing[2])
-    _draw_line(axes[1, 3], "z", [v[along_z] for v in (delta, deviation, bias)], grid.spacing[0])
+    _draw_line(axes[0, 3], "x", [v[along_x] for v in (delta, deviation, total)], grid.spacing[2])
+    _draw_line(axes[1, 3], "z", [v[along_z] for v in (delta, deviation, total)], grid.spacing[0])
     return figure
 
 
 def _draw_line(ax: Axes, axis: str, values: Sequence[Tensor], spacing: float) -> None:
     """Δn along an axis, with bars by noise and of the whole error."""
-    delta, deviation, bias = (value.numpy() for value in values)
+    delta, deviation, total = (value.numpy() for value in values)
     places = (np.arange(len(delta)) - (len(delta) - 1) / 2) * spacing
-    total = np.hypot(deviation, bias)
     ax.fill_between(places, delta - total, delta + total, color="tab:blue", alpha=0.2, linewidth=0, label="whole error")
     ax.fill_between(
         places, delta - deviation, delta + deviation, color="tab:blue", alpha=0.45, linewidth=0, label="noise"
