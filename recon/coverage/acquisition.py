@@ -17,6 +17,9 @@ MOST_VOXELS = 64
 # Condenser directions.
 DIRECTIONS = 128
 
+# Both, where one line is said of what is seen.
+ROUGHLY = 32
+
 
 @dataclass(frozen=True, eq=False)
 class NoisyAcquisition:
@@ -32,16 +35,17 @@ class NoisyAcquisition:
     acquisition: Acquisition
     noise: tuple[float, ...]
 
-    def coverage(self, expected: ExpectedSpecimen) -> Coverage:
-        """What these images tell of an expected specimen."""
+    def coverage(self, expected: ExpectedSpecimen, *, roughly: bool = False) -> Coverage:
+        """What these images tell of an expected specimen. roughly: with few directions and voxels, in a second."""
+        voxels, directions = (ROUGHLY, ROUGHLY) if roughly else (MOST_VOXELS, DIRECTIONS)
         nz, *sides = self.grid.shape
-        ny, nx = (min(side, MOST_VOXELS) for side in sides)
+        ny, nx = (min(side, voxels) for side in sides)
         medium = empty_medium(
             Grid((nz, ny, nx), self.grid.spacing), self.background, torch.zeros((), dtype=torch.float64)
         )
         setup = Setup(medium, self.microscope, self.acquisition)
         noise = torch.tensor(self.noise, dtype=torch.float64)[:, None].expand(-1, len(self.acquisition.focus))
-        return coverage(setup, noise, Fidelity(sources=DIRECTIONS), expected)
+        return coverage(setup, noise, Fidelity(sources=directions), expected)
 
     def with_prisms(self, prisms: list[tuple[Prism | None, float]]) -> "NoisyAcquisition":
         """The recording with other prisms, each with its noise."""

@@ -23,6 +23,9 @@ INCREMENT = 0.185
 
 QUANTITIES = ("volume", "mean", "mass")
 
+# Values that differ by less than this part of the largest are alike.
+SPAN = 1e-6
+
 # The largest part of a number that is believed to be lost.
 MOST_LOST = 0.5
 
@@ -42,9 +45,10 @@ class Region:
     @classmethod
     def within(cls, name: str, outline: Bool[Tensor, "z y x"], delta: Float[Tensor, "z y x"]) -> "Region":
         """The region that stands out in an outline, by Otsu's threshold between it and what is around it."""
-        values = delta[outline]
+        values = delta[outline].double()
         sign = -1.0 if float(values.sum()) < 0 else 1.0
-        if float(values.max()) == float(values.min()):
+        span, largest = float(values.max() - values.min()), float(values.abs().max())
+        if span <= SPAN * largest:
             return cls(name, outline, None if bool(values.any()) else 0.0)  # of nothing, nothing
         return cls(name, outline, sign * float(threshold_otsu((sign * values).numpy())))
 

@@ -22,6 +22,7 @@ from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.report.verdict import PoorFitWarning, Verdict, judged
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
+from recon.run.evidence.seen import coverage_of, what_lacks
 from torchdic import Grid
 from torchdic.errors import StackError
 from torchdic.files.stack import equal_step, write_stack, write_volume
@@ -131,6 +132,10 @@ def write_results(
     verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, delta)
     found["verdict"] = verdict.as_json()
     tell(verdict)
+    seen = coverage_of(config, measured.noise, delta, roughly=True)
+    found["seen"] = {"share": None if seen is None else seen.share, "lacks": what_lacks(config, seen)}
+    if found["seen"]["lacks"] is not None:
+        print(found["seen"]["lacks"])
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
     prisms = config.acquisition.prisms
 

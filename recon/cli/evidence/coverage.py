@@ -16,6 +16,7 @@ from recon.coverage.changes import Change, changes
 from recon.coverage.figure import draw_coverage
 from recon.coverage.resolution import Resolution, finest_along_z, resolution_of
 from recon.coverage.seen import Coverage
+from recon.coverage.shortcoming import shortcoming
 from recon.fit.newton.weak_hessian import lacks_of_linear_response
 from recon.report import figures
 from recon.run.data import empty_levels, load_data
@@ -34,9 +35,6 @@ PERIODS = (0.5, 1.0, 2.0, 4.0)
 
 # A change that adds less than this share of what is seen, or takes less away, is called nothing.
 NOTHING = 0.02
-
-# A recording after which Δn is uncertain by more than this part of what it was before tells next to nothing.
-HARDLY = 0.9
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -107,14 +105,8 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
         rows.append((f"{period:g} µm across z", _seen(along)))
     width = max(len(name) for name, _ in rows)
     lines = [f"  {name:<{width}}  {words}" for name, words in rows]
-    if tells_nothing(found):
-        lines.append("these images tell next to nothing of such a specimen: what is found of it will be guessed")
-    return "\n".join(lines)
-
-
-def tells_nothing(found: Coverage) -> bool:
-    """Whether images leave Δn next to as uncertain as it was before them."""
-    return found.deviation > HARDLY * found.known_before
+    lines.append(shortcoming(found) or "")
+    return "\n".join(lines).rstrip()
 
 
 def _across(resolution: Resolution) -> str:

@@ -9,12 +9,11 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from recon.cli.evidence.coverage import tells_nothing
 from recon.config.schema import ConfigError
-from recon.coverage.seen import Coverage
 from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
 from recon.run.evidence.error_bars import DEVIATION, ERROR_BARS, TOTAL, Wanted, error_bars
+from recon.run.evidence.seen import what_lacks
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack
 
@@ -60,7 +59,9 @@ def run(options: argparse.Namespace) -> None:
     outlines = dict(_outlines(options.regions, done)) if options.regions is not None else {}
     wanted = Wanted(options.refits, options.copies, options.increment, outlines)
     found, seen = error_bars(done, wanted, restart=options.restart)
-    print("\n".join(_words(found, seen, done.config.volume.background)))
+    print("\n".join(_words(found, done.config.volume.background)))
+    if (lacks := what_lacks(done.config, seen)) is not None:
+        print(lacks)
     print(f"\n{options.folder / ERROR_BARS}, {DEVIATION}, {TOTAL} and error_bars.png")
 
 
@@ -79,7 +80,7 @@ def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tenso
         yield f"region {number:g}", torch.from_numpy(labels[0] == number)
 
 
-def _words(found: ErrorBars, seen: Coverage | None, background: float) -> Iterator[str]:
+def _words(found: ErrorBars, background: float) -> Iterator[str]:
     """What was found, a line each."""
     noise, whole = map(found.typical, (found.deviation, found.total))
     if not bool(found.delta.any()):
@@ -96,8 +97,6 @@ def _words(found: ErrorBars, seen: Coverage | None, background: float) -> Iterat
         yield f"  dry mass    {_told(mass)} pg more than its medium ({mass.found:.4g})".replace("-", "−")
     yield "numbers are corrected for what turned copies lose of theirs; in brackets, as they are in the volume"
     yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
-    if seen is not None and tells_nothing(seen):
-        yield "these images tell next to nothing of such a specimen: the volume is a guess of the priors'"
 
 
 def _beyond(threshold: float) -> str:

@@ -3,15 +3,14 @@
 import hashlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 from tqdm import tqdm
 
-from recon.coverage.acquisition import NoisyAcquisition
 from recon.coverage.seen import Coverage
 from recon.earlier.direct import solved_directly
 from recon.evidence.bars import ErrorBars, bars_of
@@ -19,14 +18,13 @@ from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit, copy, planned_refits, refits
 from recon.evidence.regions import as_json
 from recon.fit.descent import minimise
-from recon.fit.newton.weak_hessian import responds_linearly
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Step
-from recon.prior.base import contrast
 from recon.recording.noise import noise_of_level
 from recon.report import figures
 from recon.run.evidence.figure import draw_error_bars
 from recon.run.evidence.kept_refits import FOLDER, KeptRefits
+from recon.run.evidence.seen import coverage_of
 from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
 from recon.run.reconstruct import Reconstructed
@@ -79,7 +77,7 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
         ) from None
     seconds = time.perf_counter() - began
     found = bars_of(estimate, [_kept(kept, estimate, *one) for one in planned], wanted.increment, wanted.outlines)
-    seen = _coverage(done, found.delta)
+    seen = coverage_of(done.config, done.measured.noise, found.delta)
     _leave(found, seen, done, wanted, seconds)
     return found, seen
 
@@ -124,18 +122,6 @@ def _identity(done: Reconstructed) -> str:
 def _kept(kept: KeptRefits, estimate: Estimate, kind: Any, number: int) -> Refit:
     truth = estimate.problem.setup.within_field(copy(estimate, number)).cpu() if kind == "turned" else None
     return Refit(kind, number, kept.delta(kind, number), truth)
-
-
-def _coverage(done: Reconstructed, delta: Float[Tensor, "z y x"]) -> Coverage | None:
-    """What the images tell of a specimen of this contrast."""
-    config, noise = done.config, done.measured.noise
-    if noise is None or min(noise) <= 0 or not responds_linearly(config.microscope, config.acquisition):
-        return None
-    recording = NoisyAcquisition(
-        config.volume.grid, config.volume.background, config.microscope, config.acquisition, tuple(noise)
-    )
-    found = contrast(delta)
-    return recording.coverage(replace(config.coverage, contrast=found) if found > 0 else config.coverage)
 
 
 def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted: Wanted, seconds: float) -> None:
