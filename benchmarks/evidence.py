@@ -5,7 +5,6 @@
     python benchmarks/evidence.py gratings              # stated and measured transfer of gratings
     python benchmarks/evidence.py prior                 # what isn't seen changes with the prior
     python benchmarks/evidence.py suggestion            # a suggested change, carried out
-    python benchmarks/evidence.py nothing               # stacks that can't say anything
 
 The scenes are those of benchmarks/scenes.py: exact fields or a finer, different model, with noise.
 """
@@ -17,6 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -27,16 +27,18 @@ import scenes
 from data_synthetic import Bead, CellPhantom, Ellipsoid
 from data_synthetic.specimen import Specimen, centres
 from recon.coverage.acquisition import DIRECTIONS, NoisyAcquisition
+from recon.coverage.changes import changes
 from recon.coverage.expected import ExpectedSpecimen
 from recon.coverage.resolution import widths
+from recon.coverage.seen import Coverage
 from recon.evidence.bars import ErrorBars, bars_of
 from recon.evidence.errors import near
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import planned_refits, refits
-from recon.evidence.regions import INCREMENT
+from recon.evidence.regions import INCREMENT, Region
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
-from recon.fit.newton.weak_hessian import cosines, weak_responses
+from recon.fit.newton.weak_hessian import cosines, waves_of_columns, weak_responses
 from recon.fit.problem import Problem, Recipe, measured_noise
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
@@ -164,8 +166,10 @@ def _count(
 ) -> None:
     """Add by how many of its errors each region's numbers are off in one draw."""
     for name, (region, numbers) in found.regions.items():
-        own = region.measures(delta, found.grid, INCREMENT)
-        true = region.measures(truth, found.grid, INCREMENT)
+        own, true = (
+            Region.within(name, region.outline, volume).measures(volume, found.grid, INCREMENT)
+            for volume in (delta, truth)
+        )
         for quantity, known in numbers.items():
             value = own[quantity] / (1 + known.usual)
             first.setdefault((name, quantity), (true[quantity], value, known.error))
@@ -251,7 +255,7 @@ def planned(scene: Scene) -> NoisyAcquisition:
     return NoisyAcquisition(scene.grid, scene.background, scene.microscope, scene.acquisition, tuple(noise))
 
 
-def best_linear(scene: Scene) -> Float[Tensor, "z y x"]:
+def best_linear(scene: Scene, expected: ExpectedSpecimen = EXPECTED) -> Float[Tensor, "z y x"]:
     """The best linear estimate from a scene's noisy images: (JᴴJ/σ² + P⁻¹)⁻¹·Jᴴ(data − empty)/σ², float64."""
     setup = Setup(
         empty_medium(scene.grid, scene.background, torch.zeros((), dtype=torch.float64)),
@@ -265,7 +269,7 @@ def best_linear(scene: Scene) -> Float[Tensor, "z y x"]:
     noise = torch.tensor(planned(scene).noise, dtype=torch.float64)[:, None, None, None]
     images = torch.fft.rfft2((scene.data.double() - levels) / noise).permute(2, 3, 0, 1).flatten(2)
     J = (T / noise[..., None]).permute(3, 4, 0, 1, 2).flatten(2, 3) @ along_z.mT
-    power = EXPECTED.power(scene.grid)
+    power = expected.power(scene.grid)
     told = J.mH @ J + torch.diag_embed(1 / power).to(J.dtype)
     waves = (along_z.mT @ torch.linalg.solve(told, J.mH @ images[..., None]))[..., 0]
     return torch.fft.irfft2(waves.permute(2, 0, 1), s=scene.grid.shape[1:])
@@ -310,7 +314,76 @@ def gratings(options: argparse.Namespace) -> None:
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
 
-COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {"bars": bars, "extents": extents, "gratings": gratings}
+# Bounds between frequencies that are guessed, half seen and seen.
+SEEN = (0.0, 0.1, 0.5, 0.9, 1.0)
+
+
+def prior(options: argparse.Namespace) -> None:
+    """How far another prior's volume differs from the default's, relative to it, by how well frequencies are seen."""
+    header("scene", "prior", *(f"seen {low:g} to {high:g}" for low, high in pairwise(SEEN)))
+    for name in options.names or ("cell", "cell, 40000 photons"):
+        scene = scenes.scene(name, options.cache)
+        covered = planned(scene).coverage(EXPECTED)
+        usual = fit(scene).delta
+        for kind in ("tv", "smooth"):
+            apart = fit(scene, Recipe(prior=kind)).delta - usual
+            shares = [_share(covered, apart, usual, low, high) for low, high in pairwise(SEEN)]
+            print(f"| {name} | {kind} | {' | '.join(f'{share:.2f}' for share in shares)} |", flush=True)
+
+
+def _share(covered: Coverage, part: Tensor, whole: Tensor, low: float, high: float) -> float:
+    """Norm of a volume over another one's, at the frequencies that are seen so well."""
+    where = covered.passed & (covered.seen > low) & (covered.seen <= high)
+    along_z = cosines(covered.grid.shape[0])
+    powers = []
+    for delta in (part, whole):
+        waves = torch.fft.rfft2(torch.tensordot(along_z, delta.double(), 1)).permute(1, 2, 0)
+        powers.append(float((waves.abs().square() * waves_of_columns(covered.grid.shape[2])[:, None])[where].sum()))
+    return math.sqrt(powers[0] / powers[1])
+
+
+# An acquisition of which much can be made better, and the bead of exact field on which that is tried: so small that all
+# frequencies are in it, as in what is expected.
+MODEST = (1, (90,), 5, 0.5)
+SMALL = Bead(0.2, 0.08, MEDIUM)
+MUCH_LIGHT = 1e5
+
+
+def suggestion(options: argparse.Namespace) -> None:
+    """Each suggested change carried out on a bead of exact field: the share of its variance that the images explain."""
+    microscope, made, name = acquired(MODEST)
+    setup = scenes.Setup("suggestion", SMALL, FINE, microscope, made, photons=MUCH_LIGHT)
+    scene = setup.scene(name, options.cache)
+    expected = ExpectedSpecimen(2 * float(scene.truth.double().square().mean().sqrt()), 0.75 * SMALL.radius)
+    before = planned(scene)
+    stated, found = before.coverage(expected).explained, explained(scene, best_linear(scene, expected))
+    print(f"{name}: explained {stated:.2f} as stated, {found:.2f} as found\n")
+    header("change", "adds, as stated", "best linear estimate", "error of newton, before", "after")
+    error = fit(scene, setup=setup_of(scene, 0)).error
+    for change in changes(before):
+        other = change.recording
+        light = MUCH_LIGHT * (before.noise[0] / other.noise[0]) ** 2
+        tried = replace(setup, microscope=other.microscope, acquisition=other.acquisition, photons=light)
+        after = tried.scene(change.name, options.cache)
+        adds = planned(after).coverage(expected).explained - stated
+        gain = explained(after, best_linear(after, expected)) - found
+        newton = fit(after, setup=setup_of(after, 0)).error
+        print(f"| {change.name} | {adds:+.3f} | {gain:+.3f} | {error:.3f} | {newton:.3f} |", flush=True)
+
+
+def explained(scene: Scene, estimate: Tensor) -> float:
+    """The share of Δn's variance that an estimate explains; no image tells its mean."""
+    truth = scene.truth.double() - scene.truth.double().mean()
+    return 1 - float((estimate - estimate.mean() - truth).square().sum() / truth.square().sum())
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
+    "bars": bars,
+    "extents": extents,
+    "gratings": gratings,
+    "prior": prior,
+    "suggestion": suggestion,
+}
 
 
 def main() -> int:

@@ -158,8 +158,8 @@ def test_a_flat_outline_is_taken_whole():
 
 def test_errors_of_numbers_are_those_of_the_refits():
     outline = torch.ones(GRID.shape, dtype=torch.bool)
-    region = Region("all", outline, None)
     delta = ball()
+    region = Region.within("all", outline, delta)
     noisy = [Refit("noise", i, delta * factor) for i, factor in enumerate((0.99, 1.0, 1.01))]
     lost = [Refit("turned", i, delta * factor, delta) for i, factor in enumerate((0.9, 0.94))]
     found = known_measures(region, delta, GRID, 0.185, [*noisy, *lost], {0: outline, 1: outline})["mass"]

@@ -5,6 +5,7 @@ import argparse
 import torch
 
 import torchdic
+from recon.cli.evidence.coverage import in_short
 from recon.cli.specimens import specimen_of, voxels
 from recon.config.reading import load
 from recon.config.resolved import leave_resolved
@@ -35,6 +36,8 @@ def run(options: argparse.Namespace) -> None:
         prepare_folder(options.out)
     planned = torchdic.plan(volume, config.microscope, config.acquisition, tolerance)
     print(planned.table())
+    if (seen := in_short(config, str(options.config))) is not None:
+        print(f"\n{seen}")
     if options.out is not None:
         write_json(options.out / "plan.json", planned.as_dict())
         leave_resolved(config, options.out)

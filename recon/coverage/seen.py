@@ -66,6 +66,11 @@ class Coverage:
         return math.sqrt(float(left.sum()) / math.prod(self.grid.shape))
 
     @property
+    def explained(self) -> float:
+        """The share of the expected variance of Δn that the images explain."""
+        return 1 - (self.deviation / self.known_before) ** 2
+
+    @property
     def _counts(self) -> Float[Tensor, " half"]:
         return waves_of_columns(self.grid.shape[2])
 

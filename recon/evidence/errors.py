@@ -1,7 +1,7 @@
 """Error bars of each voxel: of what the noise does, and of the whole error.
 
 Noise: the standard deviation of the refits to other noise. Of so few refits it is itself uncertain, by 1/√(2n), so each
-voxel's variance is averaged with those of its six neighbours.
+voxel's variance is averaged with the mean of its six neighbours'.
 
 The whole error: where the images say little, an estimate errs by how Δn changes from a voxel to its neighbours: it
 blurs, rounds and draws out. So the squared error is taken as a sum of the estimate's local variances in windows of
@@ -33,9 +33,10 @@ INSIDE, AROUND = 0.05, 2
 # What a bar of one standard deviation holds.
 HELD = 0.6827
 
-# A voxel and its six neighbours.
+# A voxel counts as much as its six neighbours together.
 NEIGHBOURS = np.zeros((3, 3, 3))
-NEIGHBOURS[1, 1, :] = NEIGHBOURS[1, :, 1] = NEIGHBOURS[:, 1, 1] = 1 / 7
+NEIGHBOURS[1, 1, :] = NEIGHBOURS[1, :, 1] = NEIGHBOURS[:, 1, 1] = 1 / 12
+NEIGHBOURS[1, 1, 1] = 1 / 2
 
 
 def near(delta: Float[Tensor, "z y x"]) -> Bool[Tensor, "z y x"]:

@@ -52,18 +52,15 @@ class Region:
             return cls(name, outline, None if bool(values.any()) else 0.0)  # of nothing, nothing
         return cls(name, outline, sign * float(threshold_otsu((sign * values).numpy())))
 
-    def voxels(self, delta: Float[Tensor, "z y x"], outline: Tensor | None = None) -> Bool[Tensor, "z y x"]:
-        """The region's voxels in a volume. outline: in place of the region's own, of a volume that is turned."""
-        within = self.outline if outline is None else outline
+    def voxels(self, delta: Float[Tensor, "z y x"]) -> Bool[Tensor, "z y x"]:
+        """The region's voxels in a volume."""
         if self.threshold is None:
-            return within
-        return within & (delta > self.threshold if self.threshold >= 0 else delta < self.threshold)
+            return self.outline
+        return self.outline & (delta > self.threshold if self.threshold >= 0 else delta < self.threshold)
 
-    def measures(
-        self, delta: Float[Tensor, "z y x"], grid: Grid, increment: float, outline: Tensor | None = None
-    ) -> dict[str, float]:
-        """Volume in µm³, mean Δn and dry mass in pg; the mean of nothing is 0. outline: as in `voxels`."""
-        there = self.voxels(delta, outline)
+    def measures(self, delta: Float[Tensor, "z y x"], grid: Grid, increment: float) -> dict[str, float]:
+        """Volume in µm³, mean Δn and dry mass in pg; the mean of nothing is 0."""
+        there = self.voxels(delta)
         number, voxel = int(there.sum()), math.prod(grid.spacing)
         total = float(delta[there].double().sum())
         return {"volume": number * voxel, "mean": total / number if number else 0.0, "mass": total * voxel / increment}
@@ -112,19 +109,22 @@ def known_measures(
     refits: Sequence[Refit],
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
 ) -> dict[str, Known]:
-    """The numbers of a region with their errors.
+    """The numbers of a region with their errors; in each refit its threshold is found anew, as it was in the estimate.
 
     delta: the estimate. refits: of both kinds. outlines: the region's outline in each turned copy, by its number.
     """
+
+    def measures(volume: Tensor, outline: Tensor) -> dict[str, float]:
+        return Region.within(region.name, outline, volume).measures(volume, grid, increment)
+
     own = region.measures(delta, grid, increment)
-    noisy = [region.measures(refit.delta, grid, increment) for refit in refits if refit.kind == "noise"]
+    noisy = [measures(refit.delta, region.outline) for refit in refits if refit.kind == "noise"]
     off: dict[str, list[float]] = {name: [] for name in QUANTITIES}
     for refit in refits:
         if refit.truth is None:
             continue
         outline = outlines[refit.number]
-        true = region.measures(refit.truth, grid, increment, outline)
-        found = region.measures(refit.delta, grid, increment, outline)
+        true, found = (measures(volume, outline) for volume in (refit.truth, refit.delta))
         for name in QUANTITIES:
             if true[name] != 0:
                 off[name].append(found[name] / true[name] - 1)

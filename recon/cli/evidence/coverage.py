@@ -90,6 +90,22 @@ def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
     return NoisyAcquisition(grid, background, config.microscope, config.acquisition, tuple(noise)), how
 
 
+def in_short(config: Config, source: str) -> str | None:
+    """What images of a configuration would tell, in one line; None where it says nothing of their noise."""
+    camera = config.microscope.camera
+    recorded = config.data is not None and all(Path(file).exists() for file in config.data.files)
+    if not recorded and (camera is None or camera.photons is None):
+        return None
+    if lacks_of_linear_response(config.microscope, config.acquisition) is not None:
+        return None
+    found = _recording(config, source)[0].coverage(config.coverage, roughly=True)
+    resolution = resolution_of(found)
+    point = f"a point's width {_across(resolution)}, {resolution.axial:.2g} µm along z"
+    told = f"seen: {found.share:.0%} of the frequencies; {point} (torchdic coverage tells more)"
+    lacks = shortcoming(found)
+    return told if lacks is None else f"{told}\n{lacks}"
+
+
 def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition, how: str) -> str:
     """What was found, a line each."""
     noise = sorted({f"{100 * level:.2g}" for level in recording.noise}, key=float)
