@@ -86,7 +86,7 @@ def test_the_deviation_by_noise_is_that_of_the_refits():
     assert float(found.mean()) == pytest.approx(0.01, rel=0.02)
     few = [noise_deviation(list(part)) for part in drawn.split(10)]
     single = [part.std(0) for part in drawn.split(10)]
-    assert float(torch.stack(few).std()) < 0.6 * float(torch.stack(single).std())
+    assert float(torch.stack(few).std()) < 0.7 * float(torch.stack(single).std())
 
 
 def blurred(volume, width):
