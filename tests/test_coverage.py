@@ -273,3 +273,12 @@ def test_a_stack_that_says_next_to_nothing_says_so(covered):
     )
     assert code == 0
     assert out.count("tell next to nothing of such a specimen") == 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_plan_says_what_is_seen_in_one_line(tmp_path, capsys):
+    noisy = "tolerance = 0.3\n" + CONFIG + '[specimen]\nkind = "bead"\nradius = 0.8\ncontrast = 0.02\n'
+    for text, told in ((noisy, True), (noisy.replace("camera = { photons = 4000, read_noise = 2.0 }", ""), False)):
+        (tmp_path / "run.toml").write_text(text, encoding="utf-8")
+        assert main(["plan", str(tmp_path / "run.toml"), "--device", "cpu"]) == 0
+        assert ("of the frequencies; a point's width" in capsys.readouterr().out) is told

@@ -394,3 +394,29 @@ def test_one_refit_tells_no_spread(folder, capsys, option):
     with pytest.raises(SystemExit):
         main(["error-bars", str(folder / "run"), option, "1"])
     assert "1 must be a number of at least 2" in capsys.readouterr().err
+
+
+def test_another_volume_says_that_its_error_bars_are_old(done, folder, capsys):
+    config = str(folder / "bead.toml")
+    assert main(["reconstruct", config, "--out", str(done), "--device", "cpu", "--restart"]) == 0
+    assert "those of an earlier volume" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        (("photons = 3000", "photons = 20"), "of the frequencies that the apertures let through: most of"),
+        (("condenser = { na = 0.5 }", "condenser = { na = 0.0 }"), "these images hardly tell depth"),
+        (("condenser = { na = 0.5 }", "condenser = { na = 0.5 }"), ""),
+    ],
+)
+def test_what_the_images_cannot_say_stands_beside_the_verdict(tmp_path, capsys, changed, line):
+    config = CONFIG.replace("steps = 4", "steps = 2").replace("[-1.0, 0.0, 1.0]", "[-2.0, -1.0, 0.0, 1.0, 2.0]")
+    (tmp_path / "bead.toml").write_text(config.replace(*changed))
+    named = str(tmp_path / "bead.toml")
+    assert main(["simulate", named, "--out", str(tmp_path / "made"), "--device", "cpu"]) == 0
+    assert main(["reconstruct", named, "--out", str(tmp_path / "run"), "--device", "cpu"]) == 0
+    told = capsys.readouterr().out
+    lacks = json.loads((tmp_path / "run" / "metrics.json").read_text())["seen"]["lacks"]
+    assert (line in told) if line else lacks is None
+    assert (lacks is None) == (line == "")

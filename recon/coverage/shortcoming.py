@@ -28,6 +28,6 @@ def shortcoming(found: Coverage) -> str | None:
 
 
 def _flat(found: Coverage, period: float) -> bool:
-    """Whether gratings of a period across z are seen only where they hardly change within the volume."""
+    """Whether gratings of a period across z are seen where they change by half a wave within the volume at most."""
     along = finest_along_z(found, period)
-    return along is None or math.isinf(along) or along >= found.grid.extent[0]
+    return along is None or math.isinf(along) or along >= 2 * found.grid.extent[0]

@@ -22,6 +22,7 @@ from recon.report import figures
 from recon.report.metrics import residual_rms
 from recon.report.verdict import PoorFitWarning, Verdict, judged
 from recon.run.checkpoint import Checkpoint, UnsavedWarning
+from recon.run.evidence.kept_refits import ERROR_BARS
 from recon.run.evidence.seen import coverage_of, what_lacks
 from torchdic import Grid
 from torchdic.errors import StackError
@@ -164,6 +165,8 @@ def write_results(
         )
     )
     (out / INTERRUPTED).unlink(missing_ok=True)
+    if (out / ERROR_BARS).exists():
+        print(f"{out / ERROR_BARS}: those of an earlier volume; find new ones with torchdic error-bars {out} --restart")
     return Result(delta, found)
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 from recon.config.schema import ConfigError
 from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
-from recon.run.evidence.error_bars import DEVIATION, ERROR_BARS, TOTAL, Wanted, error_bars
+from recon.run.evidence.error_bars import DEVIATION, TOTAL, Wanted, error_bars
+from recon.run.evidence.kept_refits import ERROR_BARS
 from recon.run.evidence.seen import what_lacks
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack

@@ -23,7 +23,7 @@ from recon.fit.step import Step
 from recon.recording.noise import noise_of_level
 from recon.report import figures
 from recon.run.evidence.figure import draw_error_bars
-from recon.run.evidence.kept_refits import FOLDER, KeptRefits
+from recon.run.evidence.kept_refits import ERROR_BARS, FOLDER, KeptRefits
 from recon.run.evidence.seen import coverage_of
 from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
@@ -32,7 +32,7 @@ from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
 
-ERROR_BARS, DEVIATION, TOTAL = "error_bars.json", "sd.ome.tif", "error.ome.tif"
+DEVIATION, TOTAL = "sd.ome.tif", "error.ome.tif"
 
 # The whole volume's own region.
 SPECIMEN = "specimen"

@@ -15,6 +15,9 @@ from torchdic.files.whole import written_whole
 
 FOLDER, IDENTITY = "refits", "identity.txt"
 
+# The numbers that refits tell.
+ERROR_BARS = "error_bars.json"
+
 
 @dataclass(frozen=True)
 class KeptRefits:
