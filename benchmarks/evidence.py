@@ -4,17 +4,21 @@
     python benchmarks/evidence.py extents               # stated and measured widths of points, on six acquisitions
     python benchmarks/evidence.py gratings              # stated and measured transfer of gratings
     python benchmarks/evidence.py prior                 # what isn't seen changes with the prior
-    python benchmarks/evidence.py suggestion            # a suggested change, carried out
+    python benchmarks/evidence.py suggestion            # suggested changes, carried out
+    python benchmarks/evidence.py nothing               # stacks that can't say much
 
 The scenes are those of benchmarks/scenes.py: exact fields or a finer, different model, with noise.
 """
 
 import argparse
+import io
 import math
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -26,6 +30,7 @@ from torch import Tensor
 import scenes
 from data_synthetic import Bead, CellPhantom, Ellipsoid
 from data_synthetic.specimen import Specimen, centres
+from recon.cli import main as main_of_torchdic
 from recon.coverage.acquisition import DIRECTIONS, NoisyAcquisition
 from recon.coverage.changes import changes
 from recon.coverage.expected import ExpectedSpecimen
@@ -126,7 +131,7 @@ def _bars(name: str, cache: Path) -> tuple[str, list[str]]:
         found = bars_of(estimate, list(refits(estimate, planned_refits(NOISE, COPIES))), INCREMENT, outlines)
         cost.append((time.process_time() - began) / of_fit - 1)
         setup = estimate.problem.setup
-        noiseless = setup.within_field(estimate.refitted(draws.clean).delta)
+        noiseless = setup.within_field(estimate.refitted(draws.clean))
         for seed in range(100 + start, 100 + start + SHARED):
             other = estimate if seed == 100 + start else draws.estimate(draws.data(seed))
             delta = setup.within_field(other.delta)
@@ -377,12 +382,79 @@ def explained(scene: Scene, estimate: Tensor) -> float:
     return 1 - float((estimate - estimate.mean() - truth).square().sum() / truth.square().sum())
 
 
+# A stack that says much, and what is changed of it.
+STACK = """
+[volume]
+shape = [12, 40, 40]
+spacing = [0.5, 0.2, 0.2]
+background = 1.335
+[microscope]
+wavelength = 0.546
+objective = { na = 0.9 }
+condenser = { na = 0.6 }
+camera = { photons = 4000 }
+[acquisition]
+focus = [-2.0, -1.0, 0.0, 1.0, 2.0]
+prisms = [{ shear = [0.0, 0.24], bias = 1.5708 }, { shear = [0.24, 0.0], bias = 1.5708 }]
+[specimen]
+kind = "bead"
+radius = 1.3
+contrast = 0.02
+[data]
+path = "made/stack.ome.tif"
+"""
+BY_ADAM = '[reconstruction]\nmethod = "adam"\nstart = "zero"'  # newton's method refuses a stack of bias 0 alone
+CHANGED = {
+    "nothing changed": {},
+    "bias 0 alone": {
+        "bias = 1.5708": "bias = 0.0",
+        "[data]": '[reconstruction]\nmethod = "adam"\nstart = "zero"\n[data]',
+    },
+    "one plane": {"[-2.0, -1.0, 0.0, 1.0, 2.0]": "[0.0]"},
+    "condenser closed": {"na = 0.6": "na = 0.0"},
+    "50 photons": {"4000": "50"},
+}
+
+
+def nothing(_: argparse.Namespace) -> None:
+    """What coverage, verdict and error bars say of stacks that can't say much, each in its last line but the files'."""
+    header("stack", "coverage", "reconstruct", "error-bars", "dry mass, pg")
+    for name, changed in CHANGED.items():
+        text = STACK
+        for before, after in changed.items():
+            text = text.replace(before, after)
+        with tempfile.TemporaryDirectory() as place:
+            config, out = Path(place) / "run.toml", Path(place) / "run"
+            config.write_text(text, encoding="utf-8")
+            _said("simulate", config, "--out", Path(place) / "made")
+            told = [_said("coverage", config, "--out", Path(place) / "covered")]
+            told += [_said("reconstruct", config, "--out", out), _said("error-bars", out)]
+            lines = [_of_images(one) for one in told]
+            mass = next((line.split("mass")[1].split("pg")[0].strip() for line in told[2] if "dry mass" in line), "–")
+        print(f"| {name} | {' | '.join(lines)} | {mass} |", flush=True)
+
+
+def _said(*words: object) -> list[str]:
+    """The lines that a command prints, its error among them."""
+    said, wrong = io.StringIO(), io.StringIO()
+    with redirect_stdout(said), redirect_stderr(wrong):
+        main_of_torchdic([str(word) for word in words])
+    errors = [line for line in wrong.getvalue().splitlines() if "error:" in line]
+    return said.getvalue().splitlines() + [line.split("toml: ")[-1] for line in errors]
+
+
+def _of_images(lines: list[str]) -> str:
+    """The line that says what the images can't tell."""
+    return next((line for line in lines if "these images" in line), "–")
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "bars": bars,
     "extents": extents,
     "gratings": gratings,
     "prior": prior,
     "suggestion": suggestion,
+    "nothing": nothing,
 }
 
 

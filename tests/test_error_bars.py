@@ -202,6 +202,12 @@ def test_the_bars_of_a_linear_estimator_are_what_its_noise_leaves():
     assert float(deviation.mean()) == pytest.approx(0.02 / 10 / math.sqrt(2), rel=0.03)
 
 
+def test_uniform_images_show_an_empty_volume():
+    problem = problem_of(images())
+    estimate = Estimate(problem, averaging(problem), lambda images: torch.tensor(0.0), GaussianMisfit, averaging)
+    assert not estimate.refitted(torch.full((1, 2, 24, 20), 0.5)).any()
+
+
 def test_each_refit_depends_on_its_number_alone():
     problem = problem_of(images())
     estimate = Estimate(problem, averaging(problem), lambda images: torch.tensor(0.02), GaussianMisfit, averaging)

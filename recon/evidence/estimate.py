@@ -48,14 +48,19 @@ class Estimate:
 
     def refitted(
         self, images: Float[Tensor, "prism focus y x"], *, going_on: bool = False, anywhere: bool = False
-    ) -> Step:
-        """The fit of other images as that of the first ones was in the end.
+    ) -> Float[Tensor, "z y x"]:
+        """Δn of the whole volume by a fit of other images, as that of the first ones was in the end.
 
         going_on: start from this estimate; else anew. anywhere: without a support, where the specimen is another one.
+        Images that are uniform show nothing: their volume is empty.
         """
+        try:
+            misfit = self.misfit(images)
+        except ValueError:  # as where a dark field has no noise
+            return torch.zeros_like(self.delta)
         newton = self.problem.method == "newton"  # what Adam ends with depends on the number of its steps
-        problem = self.problem.again(self.misfit(images), self.step, self.delta if going_on and newton else None)
-        return self.solve(_unsupported(problem) if anywhere else problem)
+        problem = self.problem.again(misfit, self.step, self.delta if going_on and newton else None)
+        return self.solve(_unsupported(problem) if anywhere else problem).delta
 
 
 def _unsupported(problem: Problem) -> Problem:

@@ -50,13 +50,13 @@ def refits(estimate: Estimate, wanted: list[tuple[Literal["noise", "turned"], in
     for kind, number in wanted:
         if kind == "noise":
             assert own is not None
-            step = estimate.refitted(estimate.recorded(own, number), going_on=True)
-            yield Refit(kind, number, setup.within_field(step.delta).cpu())
+            found = estimate.refitted(estimate.recorded(own, number), going_on=True)
+            yield Refit(kind, number, setup.within_field(found).cpu())
             continue
         truth = copy(estimate, number)
         images = estimate.recorded(estimate.images(truth), SEEDS_OF_COPIES + number)
-        step = estimate.refitted(images, anywhere=True)
-        yield Refit(kind, number, setup.within_field(step.delta).cpu(), setup.within_field(truth).cpu())
+        found = estimate.refitted(images, anywhere=True)
+        yield Refit(kind, number, setup.within_field(found).cpu(), setup.within_field(truth).cpu())
 
 
 def copy(estimate: Estimate, number: int) -> Float[Tensor, "z y x"]:
