@@ -6,8 +6,8 @@ more than as much of its medium. 1 g/ml is 1 pg/µm³.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,26 +109,47 @@ def known_measures(
     refits: Sequence[Refit],
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
 ) -> dict[str, Known]:
-    """The numbers of a region with their errors; in each refit its threshold is found anew, as it was in the estimate.
+    """The numbers of a region with their errors.
 
+    In each refit its threshold is found anew, as it was in the estimate; and it is kept, for which the error may be
+    larger, because where the part begins isn't known either. The larger one counts.
     delta: the estimate. refits: of both kinds. outlines: the region's outline in each turned copy, by its number.
     """
 
-    def measures(volume: Tensor, outline: Tensor) -> dict[str, float]:
+    def anew(volume: Tensor, outline: Tensor) -> dict[str, float]:
         return Region.within(region.name, outline, volume).measures(volume, grid, increment)
 
+    def kept(volume: Tensor, outline: Tensor) -> dict[str, float]:
+        return replace(region, outline=outline).measures(volume, grid, increment)
+
     own = region.measures(delta, grid, increment)
-    noisy = [measures(refit.delta, region.outline) for refit in refits if refit.kind == "noise"]
-    off: dict[str, list[float]] = {name: [] for name in QUANTITIES}
+    found, other = (
+        {name: _known(own[name], *_scattered(name, way, region, refits, outlines)) for name in QUANTITIES}
+        for way in (anew, kept)
+    )
+    return {
+        name: replace(one, noise=max(one.noise, other[name].noise), whole=max(one.whole, other[name].whole))
+        for name, one in found.items()
+    }
+
+
+def _scattered(
+    name: str,
+    measures: Callable[[Tensor, Tensor], dict[str, float]],
+    region: Region,
+    refits: Sequence[Refit],
+    outlines: Mapping[int, Bool[Tensor, "z y x"]],
+) -> tuple[list[float], list[float]]:
+    """A region's number in refits to other noise, and by which parts it is off in copies. measures: all its numbers."""
+    noisy, off = [], []
     for refit in refits:
         if refit.truth is None:
+            noisy.append(measures(refit.delta, region.outline)[name])
             continue
-        outline = outlines[refit.number]
-        true, found = (measures(volume, outline) for volume in (refit.truth, refit.delta))
-        for name in QUANTITIES:
-            if true[name] != 0:
-                off[name].append(found[name] / true[name] - 1)
-    return {name: _known(own[name], [one[name] for one in noisy], off[name]) for name in QUANTITIES}
+        true, found = (measures(volume, outlines[refit.number])[name] for volume in (refit.truth, refit.delta))
+        if true != 0:
+            off.append(found / true - 1)
+    return noisy, off
 
 
 def _known(found: float, noisy: Sequence[float], off: Sequence[float]) -> Known:
