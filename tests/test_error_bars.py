@@ -158,7 +158,7 @@ def test_a_flat_outline_is_taken_whole():
 
 def test_errors_of_numbers_are_those_of_the_refits():
     outline = torch.ones(GRID.shape, dtype=torch.bool)
-    delta = ball()
+    delta = torch.full(GRID.shape, 0.02)
     region = Region.within("all", outline, delta)
     noisy = [Refit("noise", i, delta * factor) for i, factor in enumerate((0.99, 1.0, 1.01))]
     lost = [Refit("turned", i, delta * factor, delta) for i, factor in enumerate((0.9, 0.94))]
@@ -169,6 +169,18 @@ def test_errors_of_numbers_are_those_of_the_refits():
     assert found.error == pytest.approx(found.value * math.sqrt((0.1**2 + 0.06**2) / 2), rel=1e-4)
     assert Known(1.0, 0.0, 0.3, 0.5).loss == pytest.approx(0.4)
     assert Known(1.0, 0.0, 0.3, 0.2).error == pytest.approx(0.3)
+
+
+def test_an_edge_that_is_not_known_is_an_error_of_the_number():
+    """Copies whose contrast falls by a fifth: of a threshold found anew the volume stays, of the kept one it falls."""
+    outline = torch.ones(GRID.shape, dtype=torch.bool)
+    delta = blurred(ball(), (0.8, 1.0, 1.0))
+    region = Region.within("all", outline, delta)
+    faded = Refit("turned", 0, 0.8 * delta, delta)
+    found = known_measures(region, delta, GRID, 0.185, [faded], {0: outline})["volume"]
+    assert found.usual == pytest.approx(0.0, abs=0.02)
+    kept = region.measures(0.8 * delta, GRID, 0.185)["volume"] / found.found - 1
+    assert found.whole == pytest.approx(-kept * found.found, rel=0.02)
 
 
 # refits
