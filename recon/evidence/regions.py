@@ -23,6 +23,9 @@ INCREMENT = 0.185
 
 QUANTITIES = ("volume", "mean", "mass")
 
+# A number in refits to other noise, and by which parts of itself it is off in copies.
+Scatter = tuple[list[float], list[float]]
+
 # Values that differ by less than this part of the largest are alike.
 SPAN = 1e-6
 
@@ -123,13 +126,9 @@ def known_measures(
         return replace(region, outline=outline).measures(volume, grid, increment)
 
     own = region.measures(delta, grid, increment)
-    found, other = (
-        {name: _known(own[name], *_scattered(name, way, region, refits, outlines)) for name in QUANTITIES}
-        for way in (anew, kept)
-    )
     return {
-        name: replace(one, noise=max(one.noise, other[name].noise), whole=max(one.whole, other[name].whole))
-        for name, one in found.items()
+        name: _known(own[name], *(_scattered(name, way, region, refits, outlines) for way in (anew, kept)))
+        for name in QUANTITIES
     }
 
 
@@ -139,7 +138,7 @@ def _scattered(
     region: Region,
     refits: Sequence[Refit],
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
-) -> tuple[list[float], list[float]]:
+) -> Scatter:
     """A region's number in refits to other noise, and by which parts it is off in copies. measures: all its numbers."""
     noisy, off = [], []
     for refit in refits:
@@ -152,12 +151,12 @@ def _scattered(
     return noisy, off
 
 
-def _known(found: float, noisy: Sequence[float], off: Sequence[float]) -> Known:
-    """A number that was found. noisy: in refits to other noise. off: by which parts it is off in copies."""
-    usual = max(float(np.mean(off)), -MOST_LOST) if off else 0.0
-    noise = float(np.std(noisy, ddof=1)) if len(noisy) > 1 else 0.0
-    whole = abs(found) * math.sqrt(float(np.mean(np.square(off)))) if off else 0.0
-    return Known(found, usual, noise / (1 + usual), whole / (1 + usual))
+def _known(found: float, anew: Scatter, kept: Scatter) -> Known:
+    """A number that was found. anew, kept: how it scatters with a threshold that is found anew, or kept."""
+    usual = max(float(np.mean(anew[1])), -MOST_LOST) if anew[1] else 0.0
+    noise = max(float(np.std(noisy, ddof=1)) if len(noisy) > 1 else 0.0 for noisy, _ in (anew, kept))
+    whole = max(math.sqrt(float(np.mean(np.square(off)))) if off else 0.0 for _, off in (anew, kept))
+    return Known(found, usual, noise / (1 + usual), abs(found) * whole / (1 + usual))
 
 
 def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], background: float) -> dict[str, Any]:
