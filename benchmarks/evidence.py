@@ -16,7 +16,6 @@ import math
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
@@ -49,10 +48,9 @@ from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
 from recon.run.reconstruct import RECOMMENDED
-from reconstruction import fit, setup_of
+from reconstruction import fit, run_chosen, setup_of
 from scenes import Scene
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective
-from torchdic.errors import SamplingWarning, WrapAroundWarning
 
 # Draws of noise, and how many of them share the error bars of the first.
 DRAWS, SHARED = 20, 5
@@ -458,21 +456,5 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
 }
 
 
-def main() -> int:
-    """Print the chosen table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=COMMANDS)
-    parser.add_argument("names", nargs="*", help="scenes; those of the page without any")
-    parser.add_argument(
-        "--cache", type=Path, default=scenes.default_cache(), help="folder of the scenes' noiseless images"
-    )
-    options = parser.parse_args()
-    torch.set_num_threads(1)
-    for category in (SamplingWarning, WrapAroundWarning):
-        warnings.simplefilter("ignore", category)
-    COMMANDS[options.what](options)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_chosen(COMMANDS, __doc__))

@@ -17,7 +17,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -517,21 +517,30 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
 }
 
 
-def main() -> int:
-    """Print the chosen table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=COMMANDS)
+def run_chosen(
+    commands: Mapping[str, Callable[[argparse.Namespace], None]],
+    description: str | None,
+    more: Callable[[argparse.ArgumentParser], object] = lambda _: None,
+) -> int:
+    """Run one of a script's commands, on one thread. more: adds arguments beside the scenes' names and their cache."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=commands)
     parser.add_argument("names", nargs="*", help="scenes; all without any")
-    parser.add_argument("--drawn", type=int, default=0, help="number of drawn scenes")
-    parser.add_argument("--method", choices=("newton", "adam"), default="newton")
-    parser.add_argument("--cache", type=Path, default=None, help="folder of the scenes' noiseless images")
+    parser.add_argument("--cache", type=Path, default=scenes.default_cache(), help="folder of scenes' noiseless images")
+    more(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     for category in (SamplingWarning, WrapAroundWarning):
         warnings.simplefilter("ignore", category)
-    COMMANDS[options.what](options)
+    commands[options.what](options)
     return 0
 
 
+def drawn_and_method(parser: argparse.ArgumentParser) -> None:
+    """What the table of all scenes takes."""
+    parser.add_argument("--drawn", type=int, default=0, help="number of drawn scenes")
+    parser.add_argument("--method", choices=("newton", "adam"), default="newton")
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_chosen(COMMANDS, __doc__, drawn_and_method))

@@ -113,11 +113,17 @@ def coverage(
     return Coverage(grid, power, operator, beyond / (1 + beyond), _passed(setup, kept))
 
 
-def _passed(setup: Setup, kept: int) -> Bool[Tensor, "y half cosine"]:
-    """The coefficients that two waves within the apertures can make: across z, and the `kept` ones along z."""
-    grid, microscope, n0 = setup.volume.grid, setup.microscope, number(setup.volume.background)
+def cutoff(setup: Setup) -> float:
+    """The highest frequency across z that two waves within the apertures can make, 1/µm."""
+    microscope, n0 = setup.microscope, number(setup.volume.background)
     lens = n0 if microscope.objective is None else microscope.objective.reach(n0)
     light = 0.0 if microscope.condenser is None else min(microscope.condenser.na, n0)
+    return (lens + light) / microscope.wavelength
+
+
+def _passed(setup: Setup, kept: int) -> Bool[Tensor, "y half cosine"]:
+    """The coefficients that two waves within the apertures can make: across z, and the `kept` ones along z."""
+    grid = setup.volume.grid
     along_y, along_x = lateral_frequencies(grid)
-    across = torch.hypot(along_y[:, None], along_x) <= (lens + light) / microscope.wavelength
+    across = torch.hypot(along_y[:, None], along_x) <= cutoff(setup)
     return across[..., None] & (torch.arange(grid.shape[0]) < kept)

@@ -9,14 +9,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from recon.coverage.seen import cutoff
 from recon.evidence.errors import ErrorModel, near, noise_deviation
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit
 from recon.evidence.regions import Known, Region, known_measures
 from recon.evidence.turned import middle, turn, turned
-from recon.fit.setup import Setup
 from torchdic import Grid
-from torchdic.scalar import number
 
 # The whole volume's own region.
 SPECIMEN = "specimen"
@@ -61,7 +60,7 @@ def bars_of(
     grid, delta = setup.field, setup.within_field(estimate.delta).cpu()
     deviation = noise_deviation([refit.delta for refit in refits if refit.kind == "noise"])
     copies = [refit for refit in refits if refit.kind == "turned"]
-    model = ErrorModel.of_copies(copies, grid, _finest(setup))
+    model = ErrorModel.of_copies(copies, grid, 1 / cutoff(setup))
     total = deviation if model is None else torch.maximum(model.deviation(delta), deviation)
     drawn = {SPECIMEN: torch.ones(delta.shape, dtype=torch.bool), **(outlines or {})}
     regions = {}
@@ -78,11 +77,3 @@ def _turned_outline(estimate: Estimate, outline: Bool[Tensor, "z y x"], copy: in
     whole = F.pad(outline.float()[None], (setup.margin,) * 4, mode="replicate")[0]
     moved = turned(whole, setup.volume.grid, middle(estimate.delta), turn(copy), order=0)
     return setup.within_field(moved) > 0
-
-
-def _finest(setup: Setup) -> float:
-    """The finest detail across z, λ/(NA of the objective and of the condenser) in µm."""
-    microscope, n0 = setup.microscope, number(setup.volume.background)
-    lens = n0 if microscope.objective is None else microscope.objective.reach(n0)
-    light = 0.0 if microscope.condenser is None else min(microscope.condenser.na, n0)
-    return microscope.wavelength / (lens + light)
