@@ -112,6 +112,21 @@ def tell(verdict: Verdict) -> None:
         print(verdict.words)
 
 
+def tell_seen(config: Config, measured: Measured, delta: Float[Tensor, "z y x"]) -> dict[str, Any]:
+    """Print what the images can't say of the specimen, if anything; returns it with the share that they see."""
+    seen = coverage_of(config, measured.noise, delta, roughly=True)
+    lacks = what_lacks(config, seen)
+    if lacks is not None:
+        print(lacks)
+    return {"share": None if seen is None else seen.share, "lacks": lacks}
+
+
+def _tell_of_earlier(out: Path) -> None:
+    """Print where a folder has error bars of an earlier volume."""
+    if (out / ERROR_BARS).exists():
+        print(f"{out / ERROR_BARS}: those of an earlier volume; find new ones with torchdic error-bars {out} --restart")
+
+
 def write_results(
     out: Path,
     config: Config,
@@ -133,10 +148,7 @@ def write_results(
     verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, delta)
     found["verdict"] = verdict.as_json()
     tell(verdict)
-    seen = coverage_of(config, measured.noise, delta, roughly=True)
-    found["seen"] = {"share": None if seen is None else seen.share, "lacks": what_lacks(config, seen)}
-    if found["seen"]["lacks"] is not None:
-        print(found["seen"]["lacks"])
+    found["seen"] = tell_seen(config, measured, delta)
     notes = [*filter(None, [str(measured.left_out)]), *map(announce_record, last.plans)]
     prisms = config.acquisition.prisms
 
@@ -165,8 +177,7 @@ def write_results(
         )
     )
     (out / INTERRUPTED).unlink(missing_ok=True)
-    if (out / ERROR_BARS).exists():
-        print(f"{out / ERROR_BARS}: those of an earlier volume; find new ones with torchdic error-bars {out} --restart")
+    _tell_of_earlier(out)
     return Result(delta, found)
 
 
