@@ -41,12 +41,12 @@ from recon.evidence.estimate import Estimate
 from recon.evidence.refits import planned_refits, refits
 from recon.evidence.regions import INCREMENT, Region
 from recon.fit.bounds import Bounds
-from recon.fit.descent import minimise
+from recon.fit.descent import solved
 from recon.fit.newton.weak_hessian import cosines, waves_of_columns, weak_responses
 from recon.fit.problem import Problem, Recipe, measured_noise
 from recon.fit.setup import Setup, empty_medium
-from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
+from recon.run.evidence.error_bars import Wanted
 from recon.run.reconstruct import RECOMMENDED
 from reconstruction import fit, run_chosen, setup_of
 from scenes import Scene
@@ -55,8 +55,8 @@ from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope,
 # Draws of noise, and how many of them share the error bars of the first.
 DRAWS, SHARED = 20, 5
 
-# Refits of each: to other noise, and of turned copies.
-NOISE, COPIES = 16, 8
+# Refits, as the command does them.
+USUAL = Wanted()
 
 # How much larger than a part of the cell its outline is drawn.
 LOOSELY = 1.3
@@ -90,12 +90,6 @@ class Draws:
         return Estimate(problem, solved(problem), lambda images: (images / photons).sqrt(), GaussianMisfit, solved)
 
 
-def solved(problem: Problem) -> Step:
-    """The last step of a descent."""
-    *_, last = minimise(problem)
-    return last
-
-
 def header(*columns: str) -> None:
     """Print a table's head."""
     print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|", flush=True)
@@ -126,7 +120,9 @@ def _bars(name: str, cache: Path) -> tuple[str, list[str]]:
         began = time.process_time()
         estimate = draws.estimate(draws.data(100 + start))
         of_fit = time.process_time() - began
-        found = bars_of(estimate, list(refits(estimate, planned_refits(NOISE, COPIES))), INCREMENT, outlines)
+        found = bars_of(
+            estimate, list(refits(estimate, planned_refits(USUAL.noise, USUAL.copies))), INCREMENT, outlines
+        )
         cost.append((time.process_time() - began) / of_fit - 1)
         setup = estimate.problem.setup
         noiseless = setup.within_field(estimate.refitted(draws.clean))

@@ -33,7 +33,7 @@ from recon.earlier.path_length import path_length
 from recon.earlier.tikhonov import tikhonov
 from recon.fit import planned
 from recon.fit.bounds import Bounds
-from recon.fit.descent import minimise
+from recon.fit.descent import solved
 from recon.fit.newton import correction, descent
 from recon.fit.newton.secants import Secants
 from recon.fit.problem import Problem, Recipe, measured_noise
@@ -126,10 +126,7 @@ def fit(
     problem = Problem.from_recipe(
         scene.data, setup or setup_of(scene), fidelity or usual, recipe, misfit, noise, support
     )
-    last = None
-    for step in minimise(problem):
-        last = step
-    assert last is not None
+    last = solved(problem)
     return Found(scene, last, problem.setup.within_field(last.delta), time.process_time() - began)
 
 
@@ -229,9 +226,8 @@ def adam_from(found: Found, steps: int = 20) -> Found:
     index, *others = problem.unknowns
     assert isinstance(index, IndexDifference)
     going_on = replace(index, given=found.last.delta)
-    began, last = time.process_time(), found.last
-    for step in minimise(replace(problem, unknowns=[going_on, *others])):
-        last = step
+    began = time.process_time()
+    last = solved(replace(problem, unknowns=[going_on, *others]))
     return Found(scene, last, setup.within_field(last.delta), time.process_time() - began)
 
 

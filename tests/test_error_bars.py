@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from recon.cli import main
@@ -90,8 +91,6 @@ def test_the_deviation_by_noise_is_that_of_the_refits():
 
 
 def blurred(volume, width):
-    from scipy.ndimage import gaussian_filter
-
     return torch.from_numpy(gaussian_filter(volume.numpy(), width))
 
 
@@ -350,7 +349,7 @@ def test_the_refits_serve_again_for_other_regions(done, folder, capsys, monkeypa
     def never(*_):
         raise AssertionError("a refit was done again")
 
-    monkeypatch.setattr("recon.run.evidence.error_bars.minimise", never)
+    monkeypatch.setattr("recon.run.evidence.error_bars.solved", never)
     labels = np.zeros((6, 26, 24), dtype=np.uint8)
     labels[:, 8:18, 7:17] = 3
     tifffile.imwrite(folder / "labels.tif", labels, metadata={"axes": "ZYX"})
@@ -400,7 +399,7 @@ def test_an_interruption_keeps_the_refits_so_far(done, folder, capsys, monkeypat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("recon.run.evidence.error_bars.minimise", stop)
+        patched.setattr("recon.run.evidence.error_bars.solved", stop)
         assert bars(folder) == 130
     assert "2 of 5 refits are left to do" in capsys.readouterr().err
     assert bars(folder) == 0

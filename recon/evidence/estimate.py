@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.fit.bounds import Bounds, SupportedBounds
+from recon.fit.bounds import Bounds
 from recon.fit.problem import Problem
 from recon.fit.step import Step
-from recon.fit.unknowns import IndexDifference, with_values
-from recon.misfit.base import Misfit
+from recon.fit.unknowns import IndexDifference, Unknown, with_values
+from recon.misfit.base import Misfit, UniformImagesError
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Estimate:
         """
         try:
             misfit = self.misfit(images)
-        except ValueError:  # as where a dark field has no noise
+        except UniformImagesError:  # as where a dark field has no noise
             return torch.zeros_like(self.delta)
         newton = self.problem.method == "newton"  # what Adam ends with depends on the number of its steps
         problem = self.problem.again(misfit, self.step, self.delta if going_on and newton else None)
@@ -66,8 +66,8 @@ class Estimate:
 def _unsupported(problem: Problem) -> Problem:
     """The problem with Δn sought everywhere."""
 
-    def freed(unknown: object) -> object:
-        if isinstance(unknown, IndexDifference) and isinstance(unknown.bounds, SupportedBounds):
+    def freed(unknown: Unknown) -> Unknown:
+        if isinstance(unknown, IndexDifference):
             return replace(unknown, bounds=Bounds(unknown.bounds.lower, unknown.bounds.upper))
         return unknown
 

@@ -20,6 +20,10 @@ from torch import Tensor
 from recon.evidence.estimate import Estimate
 from recon.evidence.turned import middle, turn, turned
 
+# What a refit is of, and with its number from 0, which one it is.
+Kind = Literal["noise", "turned"]
+Named = tuple[Kind, int]
+
 # Seeds of the noise: those of the copies begin here.
 SEEDS_OF_COPIES = 1000
 
@@ -32,18 +36,18 @@ class Refit:
     delta: what was found. truth: what it was to find, of a turned copy; Δn (z, y, x), both within the field.
     """
 
-    kind: Literal["noise", "turned"]
+    kind: Kind
     number: int
     delta: Float[Tensor, "z y x"]
     truth: Float[Tensor, "z y x"] | None = None
 
 
-def planned_refits(noise: int, copies: int) -> list[tuple[Literal["noise", "turned"], int]]:
+def planned_refits(noise: int, copies: int) -> list[Named]:
     """Kinds and numbers of so many refits, in the order in which they are done."""
     return [*(("noise", number) for number in range(noise)), *(("turned", number) for number in range(copies))]
 
 
-def refits(estimate: Estimate, wanted: list[tuple[Literal["noise", "turned"], int]]) -> Iterator[Refit]:
+def refits(estimate: Estimate, wanted: list[Named]) -> Iterator[Refit]:
     """The refits that are wanted, one by one as they are done. Each depends on its kind and number alone."""
     setup = estimate.problem.setup
     own = estimate.images(estimate.delta) if any(kind == "noise" for kind, _ in wanted) else None

@@ -126,29 +126,27 @@ def known_measures(
         return replace(region, outline=outline).measures(volume, grid, increment)
 
     own = region.measures(delta, grid, increment)
-    return {
-        name: _known(own[name], *(_scattered(name, way, region, refits, outlines) for way in (anew, kept)))
-        for name in QUANTITIES
-    }
+    ways = [_scattered(way, region, refits, outlines) for way in (anew, kept)]
+    return {name: _known(own[name], *(scatters[name] for scatters in ways)) for name in QUANTITIES}
 
 
 def _scattered(
-    name: str,
     measures: Callable[[Tensor, Tensor], dict[str, float]],
     region: Region,
     refits: Sequence[Refit],
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
-) -> Scatter:
-    """A region's number in refits to other noise, and by which parts it is off in copies. measures: all its numbers."""
-    noisy, off = [], []
-    for refit in refits:
-        if refit.truth is None:
-            noisy.append(measures(refit.delta, region.outline)[name])
-            continue
-        true, found = (measures(volume, outlines[refit.number])[name] for volume in (refit.truth, refit.delta))
-        if true != 0:
-            off.append(found / true - 1)
-    return noisy, off
+) -> dict[str, Scatter]:
+    """How each of a region's numbers scatters. measures: all of them in a volume, within an outline."""
+    noisy = [measures(refit.delta, region.outline) for refit in refits if refit.truth is None]
+    pairs = [
+        (measures(refit.truth, outlines[refit.number]), measures(refit.delta, outlines[refit.number]))
+        for refit in refits
+        if refit.truth is not None
+    ]
+    return {
+        name: ([one[name] for one in noisy], [found[name] / true[name] - 1 for true, found in pairs if true[name] != 0])
+        for name in QUANTITIES
+    }
 
 
 def _known(found: float, anew: Scatter, kept: Scatter) -> Known:

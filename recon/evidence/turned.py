@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float, Num
-from scipy.ndimage import affine_transform
+from scipy.ndimage import affine_transform, center_of_mass
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -22,14 +22,9 @@ def turn(number: int) -> Rotation:
 
 def middle(delta: Float[Tensor, "z y x"]) -> tuple[float, float, float]:
     """The |Δn|-weighted mean place of a volume, in voxels (z, y, x); the volume's centre where it is empty."""
-    weight = delta.abs().double()
-    if float(weight.sum()) == 0:
-        weight = torch.ones_like(weight)
-    places = []
-    for axis in range(3):
-        profile = weight.sum([a for a in range(3) if a != axis])
-        places.append(float((profile * torch.arange(len(profile), device=profile.device)).sum() / profile.sum()))
-    return places[0], places[1], places[2]
+    weight = delta.abs().double().cpu().numpy()
+    z, y, x = np.array(center_of_mass(weight if weight.any() else np.ones_like(weight))).tolist()
+    return z, y, x
 
 
 def turned(

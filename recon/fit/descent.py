@@ -1,5 +1,6 @@
 """A descent to the volume that explains the data, by the method that the problem names, as a generator of steps."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from jaxtyping import Float
@@ -40,6 +41,11 @@ def descend(
     """
     setup = Setup(empty_medium(grid, background, data), microscope, acquisition)
     yield from minimise(Problem.from_recipe(data, setup, fidelity, recipe), resume)
+
+
+def solved(problem: Problem) -> Step:
+    """The last step of a problem's descent; earlier ones aren't held. Raises as `minimise` does."""
+    return deque(minimise(problem), maxlen=1).pop()
 
 
 def minimise(problem: Problem, resume: Step | None = None) -> Iterator[Step]:

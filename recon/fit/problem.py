@@ -170,17 +170,15 @@ class Problem:
         the priors' last weights; None starts anew.
         Raises ValueError where the images' shape is another one.
         """
-        index, *others = self.unknowns
+        unknowns = [replace(u, given=given) if isinstance(u, IndexDifference) else u for u in self.unknowns]
         priors, weight = self.priors, self.weight
-        if isinstance(index, IndexDifference):
-            index = replace(index, given=given)
         if given is not None:
             priors = [replace(p, first=p.last) if isinstance(p, Edges) else p for p in priors]
         if weight is not None:
             weight = replace(weight, first=last.weights[-1]["tv"], held=True)
         careful = self.fidelity
         fidelity = GivenFidelity(careful.last(last.plans), careful.draft_sources, careful.matrices)
-        return replace(self, misfit=misfit, unknowns=[index, *others], priors=priors, fidelity=fidelity, weight=weight)
+        return replace(self, misfit=misfit, unknowns=unknowns, priors=priors, fidelity=fidelity, weight=weight)
 
     @classmethod
     def from_recipe(

@@ -11,6 +11,10 @@ from torch import Tensor
 from recon.misfit.level import filled, image_means
 
 
+class UniformImagesError(ValueError):
+    """The images of a prism are uniform: there is nothing to fit."""
+
+
 def spatial_variance(
     data: Float[Tensor, "prism focus y x"], mask: Bool[Tensor, "prism focus y x"] | None = None
 ) -> Float[Tensor, " prism"]:
@@ -18,7 +22,7 @@ def spatial_variance(
 
     It is taken within each image, because the differences between the backgrounds of images say nothing about the
     specimen. mask: the pixels that count (True); None is all, else an image counts by their number.
-    Raises ValueError where the images of a prism are uniform: there is nothing to fit.
+    Raises UniformImagesError where the images of a prism are uniform: there is nothing to fit.
     """
     if mask is None:
         variance = data.var(dim=(2, 3), correction=0).mean(1)
@@ -28,7 +32,7 @@ def spatial_variance(
     rounding = (4 * torch.finfo(data.dtype).eps * data.abs().amax((1, 2, 3))).square()
     for prism, (value, least) in enumerate(zip(variance.tolist(), rounding.tolist(), strict=True)):
         if not value > least:
-            raise ValueError(
+            raise UniformImagesError(
                 f"the images of prism {prism + 1} are uniform (variance {value:g}): there is nothing to fit"
             )
     return variance

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import center_of_mass, uniform_filter
 from torch import Tensor
 
 from torchdic import Grid, Prism
@@ -245,16 +245,12 @@ def centre(volume: Tensor) -> tuple[int, int, int]:
 
     Where |Δn| there is below HOLLOW of the largest, it is the voxel whose surroundings have the largest mean.
     """
-    weight = volume.detach().abs()
-    if float(weight.sum()) == 0:
+    weight = volume.detach().abs().cpu().numpy()
+    if not weight.any():
         nz, ny, nx = volume.shape
         return nz // 2, ny // 2, nx // 2
-    places = []
-    for axis in range(3):
-        profile = weight.sum([a for a in range(3) if a != axis])
-        index = np.arange(len(profile))
-        places.append(round(float((profile.cpu().numpy() * index).sum() / profile.sum().item())))
-    around = uniform_filter(weight.cpu().numpy(), AROUND)
+    places = [round(float(place)) for place in np.array(center_of_mass(weight))]
+    around = uniform_filter(weight, AROUND)
     if around[tuple(places)] < HOLLOW * around.max():
         places = [int(index) for index in np.unravel_index(int(around.argmax()), around.shape)]
     return places[0], places[1], places[2]

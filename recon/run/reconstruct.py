@@ -59,13 +59,7 @@ def reconstruct(
     ShortOfMemoryError where there is no room for the descent, before `out` is touched; InterruptedRunError on Ctrl-C,
     with a checkpoint and the volume so far saved; ResultsError where results cannot be written.
     """
-    config = spelled_out(config)
-    measured = load_data(config)
-    data = torch.from_numpy(measured.data).to(device)
-    check_room_for_volume(config.volume.grid, device)
-    made = misfit or misfit_for(config, measured)
-    problem = problem_of(config, data, made, measured)
-    identity = _identity(config, measured, problem)
+    config, measured, made, problem, identity = _asked(config, device, misfit)
     start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
     sections = None
     if config.reconstruction.method in DIRECT:
@@ -115,12 +109,7 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
     resolved = out / RESOLVED
     if not (resolved.exists() and (out / VOLUME).exists()):
         raise ConfigError(f"{out}: holds no finished reconstruction: {VOLUME} and {RESOLVED} are missing")
-    config = spelled_out(load(resolved))
-    measured = load_data(config)
-    data = torch.from_numpy(measured.data).to(device)
-    misfit = misfit_for(config, measured)
-    problem = problem_of(config, data, misfit, measured)
-    identity = _identity(config, measured, problem)
+    config, measured, misfit, problem, identity = _asked(load(resolved), device)
     if config.reconstruction.method in DIRECT:
         step, _ = solved_directly(config.reconstruction, problem, measured.noise)
     elif (out / CHECKPOINT).exists():
@@ -129,6 +118,22 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
     else:
         raise ConfigError(f"{out / CHECKPOINT}: missing: the fit can't be done again without it")
     return Reconstructed(out, config, measured, problem, misfit, step, identity)
+
+
+def _asked(
+    config: Config, device: torch.device, misfit: Callable[[Tensor], Misfit] | None = None
+) -> tuple[Config, Measured, Callable[[Tensor], Misfit], Problem, str]:
+    """What a configuration asks to be fitted: itself spelled out, its stack, what makes the misfit, and the problem.
+
+    misfit: in place of the configuration's. The last is the fit's identity.
+    """
+    config = spelled_out(config)
+    measured = load_data(config)
+    data = torch.from_numpy(measured.data).to(device)
+    check_room_for_volume(config.volume.grid, device)
+    made = misfit or misfit_for(config, measured)
+    problem = problem_of(config, data, made, measured)
+    return config, measured, made, problem, _identity(config, measured, problem)
 
 
 def spelled_out(config: Config) -> Config:

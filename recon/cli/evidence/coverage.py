@@ -72,10 +72,8 @@ def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
     lacking = lacks_of_linear_response(config.microscope, config.acquisition)
     if lacking is not None:
         raise ConfigError(f"{source}: these images show nothing of a weak specimen: they need {lacking}")
-    camera = config.microscope.camera
-    photons = None if camera is None else camera.photons
-    recorded = config.data is not None and all(Path(file).exists() for file in config.data.files)
-    if config.data is not None and (recorded or photons is None):
+    camera, photons = config.microscope.camera, _photons(config)
+    if config.data is not None and (_recorded(config) or photons is None):
         noise, how = load_data(config).noise, "measured in the stack"
         if noise is None:
             raise ConfigError(f"{source}: the stack's noise can't be measured in images so small; give more pixels")
@@ -90,11 +88,19 @@ def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
     return NoisyAcquisition(grid, background, config.microscope, config.acquisition, tuple(noise)), how
 
 
+def _recorded(config: Config) -> bool:
+    """Whether there is a stack, whose noise can be measured."""
+    return config.data is not None and all(Path(file).exists() for file in config.data.files)
+
+
+def _photons(config: Config) -> float | None:
+    """Photons per pixel of the bright field, where they are known."""
+    return None if config.microscope.camera is None else config.microscope.camera.photons
+
+
 def in_short(config: Config, source: str) -> str | None:
     """What images of a configuration would tell, in one line; None where it says nothing of their noise."""
-    camera = config.microscope.camera
-    recorded = config.data is not None and all(Path(file).exists() for file in config.data.files)
-    if not recorded and (camera is None or camera.photons is None):
+    if not (_recorded(config) or _photons(config)):
         return None
     if lacks_of_linear_response(config.microscope, config.acquisition) is not None:
         return None

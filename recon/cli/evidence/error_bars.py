@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from recon.cli.arguments import decimal
 from recon.config.schema import ConfigError
 from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
@@ -38,20 +39,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ML_PER_G",
         help=f"of the index with concentration, for dry mass (default: {INCREMENT:g} ml/g)",
     )
-    parser.add_argument(
-        "--refits",
-        type=_number,
-        default=usual.noise,
-        metavar="N",
-        help=f"fits of other noise (default: {usual.noise})",
-    )
-    parser.add_argument(
-        "--copies",
-        type=_number,
-        default=usual.copies,
-        metavar="N",
-        help=f"fits of turned copies (default: {usual.copies})",
-    )
+    for option, number, of in (("--refits", usual.noise, "other noise"), ("--copies", usual.copies, "turned copies")):
+        parser.add_argument(option, type=_number, default=number, metavar="N", help=f"fits of {of} (default: {number})")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -109,7 +98,7 @@ def _told(known: Known) -> str:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    value = decimal(text)
     if not (0 < value < float("inf")):
         raise argparse.ArgumentTypeError(f"{text} must be above 0")
     return value

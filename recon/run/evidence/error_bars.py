@@ -4,7 +4,6 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -15,9 +14,9 @@ from recon.coverage.seen import Coverage
 from recon.earlier.direct import solved_directly
 from recon.evidence.bars import ErrorBars, bars_of
 from recon.evidence.estimate import Estimate
-from recon.evidence.refits import Refit, copy, planned_refits, refits
-from recon.evidence.regions import as_json
-from recon.fit.descent import minimise
+from recon.evidence.refits import Kind, Refit, copy, planned_refits, refits
+from recon.evidence.regions import INCREMENT, as_json
+from recon.fit.descent import solved
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Step
 from recon.recording.noise import noise_of_level
@@ -34,9 +33,6 @@ from torchdic.files.whole import write_json
 
 DEVIATION, TOTAL = "sd.ome.tif", "error.ome.tif"
 
-# The whole volume's own region.
-SPECIMEN = "specimen"
-
 
 @dataclass(frozen=True)
 class Wanted:
@@ -48,7 +44,7 @@ class Wanted:
 
     noise: int = 16
     copies: int = 8
-    increment: float = 0.185
+    increment: float = INCREMENT
     outlines: Mapping[str, Bool[Tensor, "z y x"]] | None = None
 
 
@@ -93,11 +89,7 @@ def _solver(done: Reconstructed) -> Callable[[Problem], Step]:
     def directly(problem: Problem) -> Step:
         return solved_directly(done.config.reconstruction, problem, done.measured.noise)[0]
 
-    def by_descent(problem: Problem) -> Step:
-        *_, last = minimise(problem)
-        return last
-
-    return directly if done.config.reconstruction.method in DIRECT else by_descent
+    return directly if done.config.reconstruction.method in DIRECT else solved
 
 
 def _noise_of(done: Reconstructed) -> Callable[[Tensor], Tensor]:
@@ -119,14 +111,13 @@ def _identity(done: Reconstructed) -> str:
     return digest.hexdigest()
 
 
-def _kept(kept: KeptRefits, estimate: Estimate, kind: Any, number: int) -> Refit:
+def _kept(kept: KeptRefits, estimate: Estimate, kind: Kind, number: int) -> Refit:
     truth = estimate.problem.setup.within_field(copy(estimate, number)).cpu() if kind == "turned" else None
     return Refit(kind, number, kept.delta(kind, number), truth)
 
 
 def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted: Wanted, seconds: float) -> None:
     """Write the volumes, the figure and the numbers into the reconstruction's folder."""
-    out = done.out
     out = done.out
     write_volume(out / DEVIATION, found.deviation, found.grid)
     write_volume(out / TOTAL, found.total, found.grid)

@@ -3,15 +3,14 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from recon.evidence.refits import Refit
+from recon.evidence.refits import Kind, Named, Refit
 from recon.run.checkpoint import CheckpointError
-from torchdic.files.whole import written_whole
+from torchdic.files.whole import write_text, written_whole
 
 FOLDER, IDENTITY = "refits", "identity.txt"
 
@@ -36,14 +35,11 @@ class KeptRefits:
             shutil.rmtree(self.folder)
         self.folder.mkdir(exist_ok=True)
         if not told.exists():
-            with written_whole(told) as partial:
-                partial.write_text(self.identity, encoding="utf-8")
+            write_text(told, self.identity)
         elif told.read_text(encoding="utf-8") != self.identity:
             raise CheckpointError(f"{self.folder}: holds the refits of another volume; replace them with --restart")
 
-    def missing(
-        self, wanted: list[tuple[Literal["noise", "turned"], int]]
-    ) -> list[tuple[Literal["noise", "turned"], int]]:
+    def missing(self, wanted: list[Named]) -> list[Named]:
         """Those that have yet to be done."""
         return [(kind, number) for kind, number in wanted if not self._file(kind, number).exists()]
 
@@ -52,7 +48,7 @@ class KeptRefits:
         with written_whole(self._file(refit.kind, refit.number)) as partial, partial.open("wb") as file:
             np.save(file, refit.delta.numpy())
 
-    def delta(self, kind: Literal["noise", "turned"], number: int) -> Tensor:
+    def delta(self, kind: Kind, number: int) -> Tensor:
         """The volume that a refit found."""
         return torch.from_numpy(np.load(self._file(kind, number)))
 
