@@ -390,6 +390,14 @@ def test_refits_of_another_volume_are_replaced_only_on_request(done, folder, cap
     assert "another" not in (done / "refits" / "identity.txt").read_text()
 
 
+def test_files_of_unknown_origin_are_not_thrown_away(done, folder, capsys):
+    told = (done / "refits" / "identity.txt").read_text()
+    (done / "refits" / "identity.txt").unlink()
+    assert "replace them with --restart" in refused(folder, capsys)
+    assert len(list((done / "refits").glob("*.npy"))) == 5
+    (done / "refits" / "identity.txt").write_text(told)
+
+
 def test_an_interruption_keeps_the_refits_so_far(done, folder, capsys, monkeypatch):
     before = (done / "refits" / "noise_00.npy").read_bytes()
     for file in ("noise_02.npy", "turned_01.npy"):

@@ -31,12 +31,12 @@ class KeptRefits:
         restart: throw those of another one away. Raises CheckpointError where they are another one's.
         """
         told = self.folder / IDENTITY
-        if self.folder.exists() and (restart or not told.exists()):
+        if restart and self.folder.exists():
             shutil.rmtree(self.folder)
         self.folder.mkdir(exist_ok=True)
-        if not told.exists():
+        if not any(self.folder.iterdir()):
             write_text(told, self.identity)
-        elif told.read_text(encoding="utf-8") != self.identity:
+        elif not told.exists() or told.read_text(encoding="utf-8") != self.identity:
             raise CheckpointError(f"{self.folder}: holds the refits of another volume; replace them with --restart")
 
     def missing(self, wanted: list[Named]) -> list[Named]:
