@@ -260,7 +260,8 @@ def test_newtons_drafts_are_corrected_to_the_images_of_all_directions(truth):
     def misfit(step, careful):
         return float(problem.misfit(with_values(problem.unknowns, step.values, setup).images(careful)))
 
-    assert last.misfit == pytest.approx(misfit(before, fidelity), rel=0.1)
+    # a thousandth counts as noise where there is none, and a correction may be off by a tenth of it
+    assert last.misfit == pytest.approx(misfit(before, fidelity), abs=1e-4)
     assert misfit(before, Fidelity(sources=10)) > 1.5 * last.misfit
 
 

@@ -479,6 +479,8 @@ def test_few_directions_are_given_up_where_they_mislead(monkeypatch, height, mis
     steps = fitted(data, setup, Recipe(draft_sources=8), careful)
     assert steps[-1].state["newton"]["misled"] is misled
     if misled:
+        by_all = next(step for step in steps if step.state["newton"]["misled"])
+        assert by_all.weights[-1]["tv"] == by_all.weights[-2]["tv"]  # of wrong images, it waits
         monkeypatch.setattr("recon.fit.newton.descent.ASTRAY", math.inf)
         assert error(steps, delta) < 0.9 * error(fitted(data, setup, Recipe(draft_sources=8), careful), delta)
 
@@ -690,3 +692,11 @@ def test_it_goes_there_as_here(scene):
         there = fitted(send(data.double()), setup_of(send(delta.double())), Recipe(steps=3), Fidelity(sources=3))[-1]
     assert there.delta.device == DISTANT
     torch.testing.assert_close(bring(there.delta), here.delta, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.errors.SamplingWarning")
+def test_a_field_that_holds_no_frequency_that_passes_stays_empty():
+    setup = setup_of(torch.zeros(4, 2, 2), grid=Grid((4, 2, 2), (0.5, 0.2, 0.2)))
+    data = 1 + 0.1 * torch.rand(2, 3, 2, 2, generator=torch.Generator().manual_seed(0))
+    *_, last = fitted(data, setup, Recipe(steps=6))
+    assert not last.delta.any()

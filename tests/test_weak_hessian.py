@@ -9,7 +9,7 @@ from distant import DISTANT, Device, bring, send
 
 from data_synthetic import GaussianBall
 from recon.fit.newton.differences import adjoint_differences, forward_differences
-from recon.fit.newton.weak_hessian import WeakHessian, axial_band
+from recon.fit.newton.weak_hessian import WeakHessian, axial_band, weak_curvature
 from recon.fit.setup import Setup, empty_medium
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
@@ -82,6 +82,15 @@ def test_it_is_the_second_difference_of_the_misfit_at_the_empty_volume(acquisiti
     expected = curved(setup, direction)
     # random ones are as high along z as the grid goes, and then only the diagonal is kept
     assert found == pytest.approx(expected, rel=1e-5 if hessian.kept == 6 else 0.03)
+
+
+@each
+def test_planes_of_focus_at_once_or_one_by_one_give_the_same(acquisition, microscope):
+    """With little memory the responses are made plane by plane."""
+    setup, weights = setup_of(acquisition, microscope), weights_of(acquisition)
+    together, alone = (weak_curvature(setup, weights, FIDELITY, 3, memory) for memory in (AMPLE, 1))
+    for found, expected in zip(together, alone, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12 * float(expected.abs().max()))
 
 
 def test_it_follows_the_slabs_and_the_directions_of_the_images():

@@ -226,15 +226,16 @@ def _kernel_of_colour(
             to_focus, to_slice = foci - plane, depths - plane
             pz = pz[:, :1, :1]
             beating = -microscope.wavelength * torch.einsum("sa,ayx->syx", momentum, frequencies) / pz
-        cross = weights[:, None, None] * passed[:, :1, :1].conj() * passed * (background / pz)
-        # exp(i k0 (z_f − z) q) is a product, so that a matrix product sums the sources for all foci and slices at once
-        at_focus = exp_i(k0 * to_focus[:, None, None, None] * pupil.difference) * cross
-        at_slice = exp_i(-k0 * to_slice[:, None, None, None] * beating)
-        if overlaps is None:
-            at_slice = at_slice * grid.spacing[0]
-        else:
-            at_slice = torch.einsum("kz,ksyx->zsyx", overlaps.to(at_slice.dtype), at_slice)
-        return 1j * k0 * torch.einsum("fsyx,zsyx->fzyx", at_focus, at_slice)
+        length = grid.spacing[0] if overlaps is None else 1.0
+        cross = 1j * k0 * length * weights[:, None, None] * passed[:, :1, :1].conj() * passed * (background / pz)
+        # exp(i k0 (z_f − z) q) is a product, so that a matrix product for each frequency sums the sources for all foci
+        # and slices at once; the matrices' rows and columns lie side by side, or they would be copied one by one
+        difference, beating, cross = (v.permute(1, 2, 0).contiguous() for v in (pupil.difference, beating, cross))
+        at_focus = exp_i(k0 * to_focus[:, None] * difference[..., None, :]) * cross[..., None, :]
+        at_slice = exp_i(-k0 * to_slice * beating[..., None])
+        if overlaps is not None:
+            at_slice = at_slice @ overlaps.to(at_slice.dtype)
+        return (at_focus @ at_slice).permute(2, 3, 0, 1)
 
     through = weights.sum()
     if microscope.objective is not None:

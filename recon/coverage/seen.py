@@ -103,7 +103,7 @@ def coverage(
     grid = setup.volume.grid
     kept = min(grid.shape[0], axial_band(setup))
     weights = noise.double().reciprocal().square() * math.prod(setup.pixels.shape[1:]) / math.prod(grid.shape[1:])
-    matrix, diagonal = weak_curvature(setup, weights, fidelity, kept)
+    matrix, diagonal = weak_curvature(setup, weights, fidelity, kept, fidelity.memory)
     power = expected.power(grid)
     root = power[..., :kept].sqrt()
     told = root[..., None] * matrix * root[..., None, :]

@@ -366,7 +366,8 @@ class _Descent:
         hessian = self.responses(place.responding, draft, exact)
         now, place = self.renewed(place, self.formed(place, draft), draft, exact)
         if exact is not None and draft.sources < exact.sources and self.leads_astray(place.correction):
-            place, self.missed = replace(place, misled=True, correction=Correction()), None
+            # the misfit is that of wrong images: until it falls no more, it says nothing of the priors
+            place, self.missed = replace(place, misled=True, correction=Correction(), before=math.inf), None
             _, draft = drafts(exact, None)
             now, place = self.renewed(place, self.formed(place, draft), draft, exact if exact != draft else None)
         return place, hessian, now

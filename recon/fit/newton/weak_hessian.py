@@ -28,6 +28,12 @@ DAMPING = 0.01
 # Cosines beyond the band limit that are kept: the volume's faces make every wave a little wider.
 BEYOND = 3
 
+# Planes of focus whose responses are made at once. Each alone would ask for the phases of all slices again; more are no
+# faster.
+AT_ONCE = 8
+# Arrays of a response's size that are held while it is made.
+ARRAYS = 4
+
 # Amplitude of the empty field, relative to the brightest, below which a prism is dark.
 DARK = 1e-4
 
@@ -47,25 +53,27 @@ def weak_responses(setup: Setup, fidelity: Fidelity, like: Tensor) -> Complex[Te
 
 
 def weak_curvature(
-    setup: Setup, weights: Float[Tensor, "prism focus"], fidelity: Fidelity, kept: int
+    setup: Setup, weights: Float[Tensor, "prism focus"], fidelity: Fidelity, kept: int, memory: int
 ) -> tuple[Complex[Tensor, "y half low low"], Float[Tensor, "y half high"]]:
     """Σ weight·conj(T)·T over the images: matrices of the lowest cosines along z, and the others' diagonals.
 
     setup, fidelity: as for `weak_responses`; a camera's pixels count. weights: of each image. kept: number of cosines
-    that share a matrix.
+    that share a matrix. memory: bytes that responses may hold, if those of one plane hold no more.
     """
-    grid = setup.volume.grid
+    grid, acquisition = setup.volume.grid, setup.acquisition
     along_z = cosines(grid.shape[0]).to(weights)
     matrix = weights.new_zeros(grid.shape[1], grid.shape[2] // 2 + 1, kept, kept).to(weights.dtype.to_complex())
     beyond = weights.new_zeros(*matrix.shape[:2], grid.shape[0] - kept)
-    for index, focus in enumerate(setup.acquisition.focus):
-        one = Acquisition(setup.acquisition.prisms, (number(focus),))
-        T = weak_responses(replace(setup, acquisition=one, brightness=None, drift=None), fidelity, weights)[:, 0]
-        T = T * weights[:, index].sqrt()[:, None, None, None]
+    each = ARRAYS * weights.element_size() * 2 * len(acquisition.prisms) * math.prod(grid.shape)
+    planes = max(1, min(AT_ONCE, memory // each))
+    for first in range(0, len(acquisition.focus), planes):
+        few = Acquisition(acquisition.prisms, acquisition.focus[first : first + planes])
+        T = weak_responses(replace(setup, acquisition=few, brightness=None, drift=None), fidelity, weights)
+        T = T * weights[:, first : first + planes].sqrt()[..., None, None, None]
         camera = setup.microscope.camera
         if camera is not None and not setup.sees_voxels:
             T = T * camera.passed(grid.shape[1:], grid.spacing[1:], weights.dtype).to(weights.device)
-        T = T.permute(2, 3, 0, 1) @ along_z.mT.to(T.dtype)
+        T = T.flatten(0, 1).permute(2, 3, 0, 1) @ along_z.mT.to(T.dtype)
         low = T[..., :kept]
         matrix += low.mH @ low
         beyond += T[..., kept:].abs().square().sum(2)
@@ -88,9 +96,10 @@ class WeakHessian:
         frequencies = grid.shape[1] * (grid.shape[2] // 2 + 1)
         each = 3 * frequencies * weights.element_size() * 2  # a matrix's entry, its inverse, and one to invert it
         self.kept = max(1, min(grid.shape[0], axial_band(setup), math.isqrt(memory // each)))
-        matrix, beyond = weak_curvature(setup, weights, fidelity, self.kept)
+        matrix, beyond = weak_curvature(setup, weights, fidelity, self.kept, memory)
         power = matrix.diagonal(dim1=-2, dim2=-1).real.sum() + beyond.sum()
-        self.mean = float(power) / (frequencies * grid.shape[0])
+        # of a field so small that it holds no frequency that passes, any curvature will do: no image moves it
+        self.mean = float(power) / (frequencies * grid.shape[0]) or 1.0
         self._matrix, self._beyond = matrix, beyond + DAMPING * self.mean
         matrix.diagonal(dim1=-2, dim2=-1).add_(DAMPING * self.mean)
         self._differences = squared_differences(grid.shape, grid.spacing[2] / grid.spacing[0]).to(weights)
