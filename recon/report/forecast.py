@@ -20,7 +20,7 @@ from torchdic.scalar import number
 # What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
 # direction; the weak specimen's Hessian of some directions, in images of them; how often the correction is renewed; and
 # what draft images miss of the careful ones, to first order, in images of both.
-WITH_GRADIENT, MODEL, HESSIAN, RENEWED, MISSED = 2.75, 100.0, 15.0, 1 / 3, 3.0
+WITH_GRADIENT, MODEL, HESSIAN, RENEWED, MISSED = 2.75, 100.0, 4.0, 1 / 3, 0.7
 # Steps whose seconds are averaged.
 LAST = 3
 
