@@ -97,7 +97,9 @@ def header(*columns: str) -> None:
 
 def bars(options: argparse.Namespace) -> None:
     """Error bars over draws of noise: what they hold, and how often a region's truth lies within two of its errors."""
-    header("scene", "noise's bar", "spread", "held by noise's bars", "whole bar", "error", "held by whole bars", "fits")
+    header(
+        "scene", "noise's bar", "spread", "68 % of noise in", "held", "whole bar", "error", "held by whole bars", "fits"
+    )
     told: list[str] = []
     for name in options.names or ("two beads", "cell", "bead"):
         line, of_regions = _bars(name, options.cache)
@@ -130,17 +132,19 @@ def _bars(name: str, cache: Path) -> tuple[str, list[str]]:
             other = estimate if seed == 100 + start else draws.estimate(draws.data(seed))
             delta = setup.within_field(other.delta)
             barred = where & ((found.deviation > 0) | (delta != noiseless))  # elsewhere nothing is claimed
-            spread.append(float(((delta - noiseless).abs() <= found.deviation)[barred].float().mean()))
+            interval = found.interval * found.deviation
+            spread.append(float(((delta - noiseless).abs() <= interval)[barred].float().mean()))
             whole.append(float(((delta - truth).abs() <= found.total)[where].float().mean()))
             spreads.append(float((delta - noiseless)[where].square().mean()))
             errors.append(float((delta - truth)[where].square().mean()))
             _count(within, first, found, delta, truth)
-        sizes.append((found.typical(found.deviation), found.typical(found.total)))
-    noise_bar, whole_bar = (sum(s[i] for s in sizes) / len(sizes) for i in (0, 1))
+        sizes.append((found.typical(found.deviation), found.typical(found.total), found.interval))
+    noise_bar, whole_bar, interval = (sum(column) / len(sizes) for column in zip(*sizes, strict=True))
     cells = (
         name,
         f"{noise_bar:.5f}",
         f"{math.sqrt(sum(spreads) / DRAWS):.5f}",
+        f"{interval:.2f} bars",
         f"{sum(spread) / DRAWS:.0%} ({min(spread):.0%} to {max(spread):.0%})",
         f"{whole_bar:.5f}",
         f"{math.sqrt(sum(errors) / DRAWS):.5f}",

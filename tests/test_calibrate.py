@@ -13,11 +13,12 @@ import torch
 from data_synthetic import Bead
 from recon.calibration.trials.declared import Otherwise, all_mistakes
 from recon.calibration.trials.orders import Orders, Round, Tried
-from recon.calibration.trials.profile import least_misfit
+from recon.calibration.trials.profile import Least, least_misfit
 from recon.cli import main
 from recon.config import load
 from recon.config.commented import comments_of
 from recon.config.spelling import direction
+from recon.run.calibration import by_specimen
 from recon.run.calibration.found import FoundQuantity, left
 from recon.run.calibration.provenance import provenance
 from recon.run.calibration.stack import CalibrationStack
@@ -113,6 +114,23 @@ def test_an_unknown_specimen_tells_direction_and_length_and_leaves_the_bias(tmp_
     said = capsys.readouterr().out
     assert "left as told" in said
     assert "misfit / noise" in said
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_the_length_shares_what_is_found_with_biases_that_are_not_known(tmp_path, recorded, monkeypatch, alone):
+    write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
+    told = {**TOLD, "acquisition": {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}}
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    stack = CalibrationStack.read(load(tmp_path / "run.toml"), torch.device("cpu"))
+    monkeypatch.setattr(by_specimen, "find_length", lambda _: Least(-0.3, 0.01, ((-0.3, 0.1), (0.0, 0.2))))
+    changed, found = by_specimen._length(stack, alone=alone)
+    assert [quantity.name for quantity in found] == ["shear's length", "bias"][: 1 if alone else 2]
+    for prism, bias in zip(changed.config.acquisition.prisms, (1.3, -1.3), strict=True):
+        length = math.hypot(*map(float, prism.shear))
+        product = length / 0.2 * math.tan(1.3 / 2) / math.tan(abs(prism.bias) / 2)
+        assert math.log(product) == pytest.approx(-0.3, abs=1e-3)
+        assert (prism.bias == bias) is alone
+        assert prism.bias * bias > 0
 
 
 @pytest.mark.parametrize(

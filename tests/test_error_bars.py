@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.cli import main
 from recon.evidence.bars import SPECIMEN, bars_of
-from recon.evidence.errors import ErrorModel, near, noise_deviation
+from recon.evidence.errors import ErrorModel, near, noise_deviation, noise_interval
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit, planned_refits, refits
 from recon.evidence.regions import Known, Region, known_measures
@@ -88,6 +88,21 @@ def test_the_deviation_by_noise_is_that_of_the_refits():
     few = [noise_deviation(list(part)) for part in drawn.split(10)]
     single = [part.std(0) for part in drawn.split(10)]
     assert float(torch.stack(few).std()) < 0.7 * float(torch.stack(single).std())
+
+
+def test_the_interval_of_noise_holds_68_percent_of_what_it_does():
+    random = torch.Generator().manual_seed(0)
+    everywhere = torch.ones(6, 12, 12, dtype=torch.bool)
+    normal = torch.randn(17, 6, 12, 12, generator=random)
+    seldom = normal * (torch.rand(normal.shape, generator=random) < 0.3)  # most voxels stay where they are
+    for kind, volumes in (("normal", normal), ("seldom", seldom)):
+        *known, unseen = volumes
+        interval = noise_interval(known, everywhere)
+        off, bar = (unseen - torch.stack(known).mean(0)).abs(), noise_deviation(known)
+        assert float((off <= interval * bar).float().mean()) == pytest.approx(0.68, abs=0.05)
+        assert interval == pytest.approx(1.0, abs=0.1) if kind == "normal" else interval < 0.6
+    assert noise_interval(list(normal[:2]), everywhere) == 1.0  # two don't tell
+    assert noise_interval([torch.zeros(6, 12, 12)] * 4, everywhere) == 1.0
 
 
 def blurred(volume, width):
@@ -337,6 +352,7 @@ def test_it_leaves_volumes_a_figure_and_numbers(done):
     told = json.loads((done / "error_bars.json").read_text())
     specimen = told["regions"]["specimen"]
     assert told["refits"]["noise"] == 3
+    assert told["noise_interval"] > 0
     assert specimen["volume_um3"]["value"] == pytest.approx(4 / 3 * math.pi, rel=0.6)
     assert 1.4 < specimen["mean_index"]["value"] < 1.44
     assert specimen["dry_mass_pg"]["error"] > 0

@@ -152,7 +152,8 @@ def find_aperture(beside: Beside) -> Least:
 def find_length(beside: Beside) -> Least:
     """The logarithm of the shear's length over the declared one, of all settings alike, with the declared biases.
 
-    What the images tell is the product s·cot(b/2): where the bias was declared wrongly, the length makes up for it.
+    What the images tell is the product s·cot(b/2), which the length changes here; see
+    `recon.calibration.length_and_bias` for how the two share it.
     Where another one is found, it is sought once more beside that, because a wrong one gives the priors a wrong weight.
     """
     axes = axes_of(beside.setup.acquisition)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from recon.coverage.seen import cutoff
-from recon.evidence.errors import ErrorModel, near, noise_deviation
+from recon.evidence.errors import ErrorModel, near, noise_deviation, noise_interval
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit
 from recon.evidence.regions import Known, Region, known_measures
@@ -26,13 +26,15 @@ class ErrorBars:
     """What a volume's error bars are.
 
     grid: of the volume. delta: Δn. deviation: its standard deviation by noise. total: that of its whole error, noise
-    and what is lost; all (z, y, x). regions: its parts with their numbers, by name.
+    and what is lost; all (z, y, x). interval: how many standard deviations by noise hold 68 % of what it does. regions:
+    the volume's parts with their numbers, by name.
     """
 
     grid: Grid
     delta: Float[Tensor, "z y x"]
     deviation: Float[Tensor, "z y x"]
     total: Float[Tensor, "z y x"]
+    interval: float
     regions: Mapping[str, tuple[Region, Mapping[str, Known]]]
 
     def typical(self, deviation: Float[Tensor, "z y x"]) -> float:
@@ -58,7 +60,8 @@ def bars_of(
     """
     setup = estimate.problem.setup
     grid, delta = setup.field, setup.within_field(estimate.delta).cpu()
-    deviation = noise_deviation([refit.delta for refit in refits if refit.kind == "noise"])
+    by_noise = [refit.delta for refit in refits if refit.kind == "noise"]
+    deviation, interval = noise_deviation(by_noise), noise_interval(by_noise, near(delta))
     copies = [refit for refit in refits if refit.kind == "turned"]
     model = ErrorModel.of_copies(copies, grid, 1 / cutoff(setup))
     total = deviation if model is None else torch.maximum(model.deviation(delta), deviation)
@@ -68,7 +71,7 @@ def bars_of(
         region = Region.within(name, outline, delta)
         moved = {refit.number: _turned_outline(estimate, outline, refit.number) for refit in copies}
         regions[name] = region, known_measures(region, delta, grid, increment, refits, moved)
-    return ErrorBars(grid, delta, deviation, total, regions)
+    return ErrorBars(grid, delta, deviation, total, interval, regions)
 
 
 def _turned_outline(estimate: Estimate, outline: Bool[Tensor, "z y x"], copy: int) -> Bool[Tensor, "z y x"]:

@@ -78,6 +78,7 @@ def _words(found: ErrorBars, background: float) -> Iterator[str]:
         return
     parts = f"± {noise:.2g} by noise, ± {found.lost:.2g} by what is lost"
     yield f"Δn inside and near the specimen: ± {whole:.2g}, of which {parts}"
+    yield f"68 % of what noise does there lies within {found.interval:.2g} of its standard deviations"
     for name, (region, numbers) in found.regions.items():
         volume, mean, mass = (numbers[quantity] for quantity in ("volume", "mean", "mass"))
         above = "" if region.threshold is None else f", {_beyond(region.threshold)}"

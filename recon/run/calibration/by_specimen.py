@@ -6,13 +6,23 @@ from dataclasses import replace
 import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images, find_length
+from recon.calibration.length_and_bias import Shared, shared
 from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
-from recon.run.calibration.found import DIRECTION, LENGTH, FoundQuantity, left, plain, rounded, rounded_shear
+from recon.run.calibration.found import (
+    DIRECTION,
+    LENGTH,
+    FoundQuantity,
+    left,
+    plain,
+    rounded,
+    rounded_angle,
+    rounded_shear,
+)
 from recon.run.calibration.stack import CalibrationStack
-from torchdic import Acquisition
+from torchdic import Acquisition, Prism
 from torchdic.scalar import number
 
 # Planes whose brightness and drift are looked at, at most.
@@ -36,31 +46,36 @@ AGREES_ANGLE, AGREES = 2.0, 3.0
 # A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
 SHOWS = 4.0
 
+# What tells the biases besides an unknown specimen.
+BIASES = {"bias", "compensator's zero"}
+
 PRODUCT = "beside an unknown specimen the images tell no more than its product with the shear's length; use a bead"
 
 
 def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The stack with what shows beside an unknown specimen, and each quantity. known: what has been found already."""
     beside = stack.beside()
-    names = _untold(stack.config, known)
     if not can_be_tried(beside.problem(beside.setup)):
         why = "no prism has a linear response, without which no volume can be fitted beside it"
-        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na", LENGTH)] + names
+        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na", LENGTH)] + _untold(
+            stack.config, known
+        )
     print("the shear's direction, the condenser's aperture and the shear's length, by volumes fitted with several …")
     beside = beside.held()
     stack, angles = _angles(stack, beside)
     beside = replace(beside, setup=replace(beside.setup, acquisition=_of_part(stack, beside)))
     stack, aperture = _aperture(stack, beside)
-    stack, length = _length(stack)
+    stack, length = _length(stack, alone=bool(BIASES & known))
     stack, images = _images(stack)
-    return stack, [angles, *aperture, length, *images, *names]
+    untold = _untold(stack.config, known | {quantity.name for quantity in length})
+    return stack, [angles, *aperture, *length, *images, *untold]
 
 
 def _untold(config: Config, known: set[str]) -> list[FoundQuantity]:
     """What an unknown specimen doesn't tell, and why."""
     prisms = [prism for prism in config.acquisition.prisms if prism is not None]
     found: list[FoundQuantity] = []
-    if not {"bias", "compensator's zero"} & known:
+    if not BIASES & known:
         several = len({round(abs(number(prism.bias)), 3) for prism in prisms}) > 1 or None in config.acquisition.prisms
         pairs = len(prisms) > 1
         why = PRODUCT
@@ -131,33 +146,57 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
     return stack.with_config(replace(config, microscope=microscope)), [quantity]
 
 
-def _length(stack: CalibrationStack) -> tuple[CalibrationStack, FoundQuantity]:
-    """The shear's length, of all settings alike, where two of them tell the differential part of an image."""
+def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, list[FoundQuantity]]:
+    """The shear's length, of all settings alike, and the biases: where two settings tell an image's differential part.
+
+    alone: whether the biases are known, so that all that is found is the length's.
+    """
     config = stack.config
     prisms = [prism for prism in config.acquisition.prisms if prism is not None]
     told = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in prisms]
     if len(config.acquisition.prisms) < 2:
         why = "one setting's images don't tell their differential part from a bright field's; use two, or a bead"
-        return stack, left(LENGTH, "µm", told, why)
+        return stack, [left(LENGTH, "µm", told, why)]
     beside = stack.beside()
     found = find_length(beside)
     deviation = math.hypot(found.deviation, found.unexplained, MODEL_LENGTH)
     if deviation > UNSURE_LENGTH:
         why = "volumes explain the images as well with other lengths; use a bead"
-        return stack, left(LENGTH, "µm", told, why + _hidden([found], beside))
-    factor = math.exp(found.value)
-    values = [rounded(length * factor, 4) for length in told]
-    sure = [rounded(length * factor * deviation, 2) for length in told]
+        return stack, [left(LENGTH, "µm", told, why + _hidden([found], beside))]
     how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
+    biases = [number(prism.bias) for prism in prisms]
     if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
-        return stack, FoundQuantity(LENGTH, "µm", told, values, sure, how)
-    made = [
-        prism if prism is None else rounded_shear(replace(prism, shear=tuple(number(s) * factor for s in prism.shear)))
-        for prism in config.acquisition.prisms
+        return stack, [_of_length(told, Shared(found.value, deviation, tuple(biases), ()), how)]
+    if alone:
+        parts = Shared(found.value, deviation, tuple(biases), ())
+        return _with_prisms(stack, parts), [_of_length(told, parts, how)]
+    parts = shared(found.value, deviation, biases)
+    parts = replace(parts, biases=tuple(map(rounded_angle, parts.biases)))
+    how += f"; length/tan(bias/2) changes by {math.expm1(found.value):+.1%}, which length and bias share"
+    values, unsure = ([rounded(v, n) for v in part] for part, n in ((parts.biases, 5), (parts.bias_deviations, 2)))
+    bias = FoundQuantity("bias", "rad", biases, values, unsure, f"{PRODUCT}; see its length")
+    return _with_prisms(stack, parts), [_of_length(told, parts, how), bias]
+
+
+def _of_length(told: list[float], parts: Shared, how: str) -> FoundQuantity:
+    values = [rounded(length * math.exp(parts.length), 4) for length in told]
+    unsure = [rounded(value * parts.length_deviation, 2) for value in values]
+    return FoundQuantity(LENGTH, "µm", told, values, unsure, how)
+
+
+def _with_prisms(stack: CalibrationStack, parts: Shared) -> CalibrationStack:
+    """The stack with the lengths and the biases of its prisms changed."""
+    acquisition, biases = stack.config.acquisition, iter(parts.biases)
+    prisms = [
+        prism if prism is None else replace(_stretched(prism, math.exp(parts.length)), bias=next(biases))
+        for prism in acquisition.prisms
     ]
-    calibrated = replace(config, acquisition=replace(config.acquisition, prisms=made))
-    return stack.with_config(calibrated), FoundQuantity(LENGTH, "µm", told, values, sure, how)
+    return stack.with_config(replace(stack.config, acquisition=replace(acquisition, prisms=prisms)))
+
+
+def _stretched(prism: Prism, factor: float) -> Prism:
+    return rounded_shear(replace(prism, shear=tuple(number(s) * factor for s in prism.shear)))
 
 
 def _images(stack: CalibrationStack) -> tuple[CalibrationStack, list[FoundQuantity]]:

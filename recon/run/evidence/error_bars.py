@@ -130,6 +130,7 @@ def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted:
             "lost": found.lost,
             "whole": found.typical(found.total),
         },
+        "noise_interval": found.interval,
         "seen_share": None if seen is None else seen.share,
         "regions": as_json(found.regions, done.config.volume.background),
     }
