@@ -1,12 +1,15 @@
 """The folder of a run: a file in its place is seen first, and results are replaced only where the user says so."""
 
 import argparse
+import subprocess
+import sys
 
 import pytest
 
 from recon.cli import main
 from recon.cli.commands import COMMANDS
 from recon.config.schema import ConfigError
+from recon.run.folder.lock import folders_released, hold
 from recon.run.folder.prepared import check_folder, prepare_folder
 from recon.run.folder.results import FinishedError, check_no_results
 
@@ -97,3 +100,43 @@ def test_a_folder_is_looked_at_without_being_made(tmp_path):
     for prepare in (check_folder, prepare_folder):
         with pytest.raises(ConfigError, match="can't be written to"):
             prepare(tmp_path / "file" / "b")
+
+
+@pytest.fixture
+def other_run(tmp_path):
+    """Another process that holds a folder, until it is killed."""
+    (tmp_path / "out").mkdir()
+    program = (
+        "import sys, time; from pathlib import Path; from recon.run.folder.lock import folders_released, hold\n"
+        "with folders_released():\n"
+        "    hold(Path(sys.argv[1])); hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)"
+    )
+    words = [sys.executable, "-c", program, tmp_path / "out"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_two_runs_in_one_folder_are_one_too_many(tmp_path, capsys, other_run):
+    """The second one says so in a line and leaves all as it is; a run that was killed holds nothing."""
+    out = tmp_path / "out"
+    (tmp_path / "in.toml").write_text(CONFIG.replace('data = { path = "missing.tif" }', SPECIMEN))
+    command = ("simulate", tmp_path / "in.toml", "--out", out)
+    line = said_no(capsys, *command)
+    assert f"{out}: another run is writing into it; wait for its end, or name another folder" in line
+    assert [path.name for path in out.iterdir()] == [".lock"]
+    other_run.kill()
+    other_run.wait()
+    assert main([str(word) for word in command]) == 0
+    with folders_released():  # the command has released it
+        hold(out)
+        prepare_folder(out)  # and this one may hold it twice
+
+
+def test_outside_a_command_nothing_is_held(tmp_path, other_run):
+    hold(tmp_path / "out")
+
+
+SPECIMEN = 'specimen = { kind = "bead", radius = 0.5, contrast = 0.02, background = 1.4 }\nfidelity = { sources = 2 }'

@@ -16,6 +16,7 @@ from recon.cli.own_stack.options import SEVERAL
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
+from recon.run.folder.lock import FolderInUseError, folders_released
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
@@ -24,6 +25,9 @@ from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysE
 from torchdic.files.whole import WriteError
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+# What the user can put right, in one line that says what.
+WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
 
 
 @dataclass(frozen=True)
@@ -109,8 +113,17 @@ def main(typed: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments.repeated(words, several))
     _show_each_warning_once()
     try:
-        options.run(options)
-    except (ConfigError, StackError, CheckpointError, FinishedError, ResultsError, WriteError) as error:
+        with folders_released():
+            options.run(options)
+    except (
+        ConfigError,
+        StackError,
+        CheckpointError,
+        FinishedError,
+        FolderInUseError,
+        ResultsError,
+        WriteError,
+    ) as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)

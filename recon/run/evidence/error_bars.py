@@ -24,6 +24,7 @@ from recon.report import figures
 from recon.run.evidence.figure import draw_error_bars
 from recon.run.evidence.kept_refits import ERROR_BARS, FOLDER, KeptRefits
 from recon.run.evidence.seen import coverage_of
+from recon.run.folder.prepared import prepare_folder
 from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
 from recon.run.reconstruct import Reconstructed
@@ -58,6 +59,7 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
     and InterruptedRunError on Ctrl-C, with the refits so far kept.
     """
     estimate, out = estimate_of(done), done.out
+    prepare_folder(out)
     kept = KeptRefits(out / FOLDER, _identity(done))
     kept.begin(restart=restart)
     planned = planned_refits(wanted.noise, wanted.copies)

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from recon.config.schema import ConfigError
+from recon.run.folder.lock import hold
 from torchdic.files.whole import written_whole
 
 
@@ -17,11 +18,15 @@ def check_folder(out: Path) -> None:
 
 
 def prepare_folder(out: Path) -> None:
-    """Make sure that `out` is a folder that can be written to. Raises ConfigError."""
+    """Make sure that `out` is a folder that can be written to, and that no other run writes into it.
+
+    Raises ConfigError where it can't, and FolderInUseError where another run does.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
         with written_whole(out / ".writable"):
             pass
         (out / ".writable").unlink()
+        hold(out)
     except OSError as error:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
