@@ -68,6 +68,7 @@ class Format:
     read_series: as `read`, with the number of a series, counted from 0, of which a file may hold several; None for a
         format whose files hold one.
     setup: what such a file says of its microscope; None for a format that says nothing.
+    folder: whether such a file is a folder of files.
     """
 
     name: str
@@ -77,6 +78,7 @@ class Format:
     dtypes: tuple[str, ...] = ()
     read_series: Callable[[Path, int], Stack] | None = None
     setup: Callable[[Path], StatedSetup] | None = None
+    folder: bool = False
 
 
 def shape_text(shape: Sequence[int]) -> str:

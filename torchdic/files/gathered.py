@@ -11,6 +11,7 @@ import numpy as np
 
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.described.setup import StatedSetup, setup_in_words, setup_of_all
+from torchdic.files.extras.ome_zarr import is_zarr
 from torchdic.files.format import Stack
 from torchdic.files.joined import check_alike
 from torchdic.files.stack import FORMATS, format_of, read_stack
@@ -108,7 +109,7 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     """The files as typed, or those of a folder in natural order, and the folder if one was named."""
     if not paths:
         raise StackError("no stack is named: give a file, several, or a folder of planes")
-    folders = [path for path in paths if path.is_dir()]
+    folders = [path for path in paths if path.is_dir() and not format_of(path).folder]
     if not folders:
         known: dict[Path, Path] = {}
         for path in paths:
@@ -119,7 +120,8 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     if len(paths) > 1:
         raise StackError(f"{folders[0]}: is a folder; give one folder, or files")
     suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
-    found = [file for file in folders[0].iterdir() if file.name.lower().endswith(suffixes) and file.is_file()]
+    found = [file for file in folders[0].iterdir() if file.name.lower().endswith(suffixes) or is_zarr(file)]
+    found = [file for file in found if file.is_file() or format_of(file).folder]
     found = [file for file in found if not file.name.startswith(".")]
     if not found:
         others = sorted(file for file in folders[0].iterdir() if not file.name.startswith("."))

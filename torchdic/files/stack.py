@@ -16,25 +16,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
+from torchdic.files.extras.nikon import ND2
+from torchdic.files.extras.ome_zarr import OME_ZARR_4, OME_ZARR_5, is_zarr
+from torchdic.files.extras.zeiss import CZI
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.png import PNG
 from torchdic.files.tiff import TIFF
-from torchdic.files.vendors.nikon import ND2
-from torchdic.files.vendors.zeiss import CZI
-from torchdic.files.whole import WriteError, written_whole
+from torchdic.files.whole import WriteError, folder_written_whole, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
-FORMATS: list[Format] = [TIFF, PNG, ND2, CZI]
+FORMATS: list[Format] = [TIFF, PNG, ND2, CZI, OME_ZARR_5, OME_ZARR_4]
 
 # The first bytes of a JPEG, whatever its name. Reading one would take its blocks for specimen.
 _JPEG = b"\xff\xd8\xff"
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format of a file, by the suffix of its name; TIFF for a suffix that no format has."""
+    """The format of a file, by the suffix of its name; TIFF for a suffix that no format has.
+
+    A folder that Zarr has written is OME-Zarr, whatever its name.
+    """
     name = Path(path).name.lower()
-    return next((known for known in FORMATS if name.endswith(known.suffixes)), TIFF)
+    usual = OME_ZARR_4 if is_zarr(Path(path)) else TIFF
+    return next((known for known in FORMATS if name.endswith(known.suffixes)), usual)
 
 
 def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack:
@@ -55,8 +60,8 @@ def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack
     Warns StackWarning of a size that is no length, of time that is taken as the focus, and of a calibration.
     """
     path = Path(path)
-    _check_openable(path)
     known = format_of(path)
+    _check_openable(path, known)
     try:
         stack = known.read(path) if series is None else _read_one(known, path, series)
     except (StackError, StackWarning):  # the latter where warnings are errors
@@ -173,13 +178,15 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
         raise StackError(f"{path}: {known.name} can be read but not written; choose a name that ends in .ome.tif")
     _check_writable(path, stack, known.dtypes)
     try:
-        with written_whole(path) as partial:
+        with (folder_written_whole if known.folder else written_whole)(path) as partial:
             known.write(partial, stack, compression)
     except WriteError as error:
         raise StackError(str(error)) from error
 
 
-def _check_openable(path: Path) -> None:
+def _check_openable(path: Path, known: Format) -> None:
+    if known.folder and path.is_dir():
+        return
     try:
         with path.open("rb") as file:
             size, head = os.fstat(file.fileno()).st_size, file.read(len(_JPEG))
@@ -189,6 +196,8 @@ def _check_openable(path: Path) -> None:
         raise StackError(f"{path}: is a folder; a stack is one file, which torchdic new makes of a folder") from error
     except OSError as error:
         raise StackError(f"{path}: cannot be opened: {error.strerror or error}") from error
+    if known.folder:
+        raise StackError(f"{path}: is a file; {known.name} is a folder of files: unpack it")
     if size == 0:
         raise StackError(f"{path}: is empty, 0 bytes")
     if head == _JPEG:

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 
 class WriteError(OSError):
@@ -33,6 +34,27 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         with _moved_there(path) as partial:
             yield partial
+    except OSError as error:
+        raise WriteError.of(path, error) from error
+
+
+@contextmanager
+def folder_written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """As `written_whole`, for a folder: give an empty one beside `path`, which takes its place when the block ends."""
+    path = Path(path)
+    try:
+        with TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as beside:
+            partial, earlier = Path(beside) / path.name, Path(beside) / "earlier"
+            partial.mkdir()
+            yield partial
+            if path.exists():
+                path.rename(earlier)
+            try:
+                partial.rename(path)
+            except OSError:
+                if earlier.exists():
+                    earlier.rename(path)
+                raise
     except OSError as error:
         raise WriteError.of(path, error) from error
 

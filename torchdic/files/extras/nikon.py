@@ -8,8 +8,8 @@ import numpy as np
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import arrange, place_axis
 from torchdic.files.described.setup import StatedSetup
+from torchdic.files.extras.package import package
 from torchdic.files.format import Format, Stack
-from torchdic.files.vendors.extra import package
 
 
 def _read(path: Path) -> Stack:

@@ -9,8 +9,8 @@ import numpy as np
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import arrange
 from torchdic.files.described.setup import IMMERSIONS, StatedSetup
+from torchdic.files.extras.package import package
 from torchdic.files.format import Format, Stack
-from torchdic.files.vendors.extra import package
 
 _METRE = 1e6  # CZI's scalings are in metres
 
