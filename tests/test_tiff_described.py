@@ -5,10 +5,11 @@ import pytest
 import tifffile
 
 from recon.recording.preparation import ExpectedStack, prepare
+from torchdic import Grid
 from torchdic.errors import StackWarning
 from torchdic.files.format import Stack
 from torchdic.files.full_scale import full_scale
-from torchdic.files.stack import read_stack
+from torchdic.files.stack import read_stack, write_stack, write_volume
 
 PLANES = np.arange(3 * 9 * 7, dtype=np.uint16).reshape(3, 9, 7) + 100
 
@@ -263,3 +264,25 @@ def test_saturated_pixels_of_12_bits_in_16_are_warned_of(shift):
     expected = ExpectedStack(biases=(1.5,), focus=(0.0, 1.0, 2.0), pixel_size=(0.2, 0.2))
     with pytest.warns(StackWarning, match=f"are saturated at {4095 << shift}"):
         prepare(Stack(data), expected)
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["stack", "volume"])
+def test_ome_xml_is_what_its_schema_asks_for(tmp_path, kind):
+    """By the schema of the Open Microscopy Environment, and at the right scale, in the right unit."""
+    ome_types = pytest.importorskip("ome_types", reason="ome-types isn't installed")
+    path = tmp_path / "written.ome.tif"
+    if kind == "stack":
+        write_stack(path, np.stack([PLANES, PLANES]), (0.2, 0.1), 0.5, names=("plus", "minus"), bits=12)
+    else:
+        write_volume(path, PLANES / 1e5, Grid(PLANES.shape, (0.5, 0.2, 0.1)))
+    with tifffile.TiffFile(path) as tif:
+        (found,) = ome_types.from_xml(tif.ome_metadata, validate=True).images
+    pixels = found.pixels
+    assert (pixels.size_c, pixels.size_z, pixels.size_y, pixels.size_x) == (2 if kind == "stack" else 1, *PLANES.shape)
+    assert [getattr(pixels, f"physical_size_{axis}") for axis in "zyx"] == pytest.approx([0.5, 0.2, 0.1])
+    assert {getattr(pixels, f"physical_size_{axis}_unit").value for axis in "zyx"} == {"µm"}
+    assert [channel.name for channel in pixels.channels] == (["plus", "minus"] if kind == "stack" else ["delta n"])
+    assert pixels.significant_bits == (12 if kind == "stack" else None)
