@@ -108,7 +108,7 @@ def test_an_unknown_specimen_tells_direction_and_length_and_leaves_the_bias(tmp_
     assert not record["bias"]["found"]
     assert "its product with the shear's length" in record["bias"]["how"]
     assert record["shear's length"]["found"]
-    assert record["shear's length"]["value"] == pytest.approx([0.2] * 2, rel=0.12)
+    assert record["shear's length"]["value"] == pytest.approx([0.2], rel=0.12)
     assert "gauge" in record["focus zero"]["how"]
     assert not (tmp_path / "out" / "microscope.toml").exists()
     said = capsys.readouterr().out
@@ -287,7 +287,9 @@ def test_provenance_says_what_was_calibrated_and_how_well(tmp_path):
         left("shear's angle", "rad", [0.1], "no"),
     ]
     reversed_ = replace(config.acquisition, focus=config.acquisition.focus[::-1])
-    made = provenance(config, config, orders("planes reversed", reversed_, 1), found, comments)
+    prisms = [replace(p, shear=tuple(s * 0.25 / 0.3 for s in p.shear)) for p in config.acquisition.prisms]
+    changed = replace(config, acquisition=replace(reversed_, prisms=prisms))
+    made = provenance(config, changed, orders("planes reversed", reversed_, 1), found, comments)
     first, second = made["acquisition.prisms[0]"], made["acquisition.prisms[1]"]
     assert first == (
         "a: length calibrated: ± 0.011 µm, told 0.3 µm; angle measured: ± 2°; bias calibrated: ± 5.7°, told 90°"
@@ -296,6 +298,9 @@ def test_provenance_says_what_was_calibrated_and_how_well(tmp_path):
     assert made["microscope.condenser"] == "assumed: the ring; calibrated: 0.49 ± 0.02 agrees with it"
     assert made["acquisition.prisms"] == "angle: from right towards down; calibrated: planes reversed"
     assert made["acquisition.focus"] == "step file; calibrated: the planes' order, which was told reversed"
+    stayed = provenance(config, config, orders("planes reversed", reversed_, 1), found, comments)
+    said = "a: length assumed: usual; told, calibrated: 0.25 ± 0.011 µm agrees; angle measured"
+    assert stayed["acquisition.prisms[0]"].startswith(said)
     as_told = provenance(config, config, orders("all is as declared", config.acquisition, 0), found[:1], comments)
     assert as_told == {
         "acquisition.focus": "step file; measured: the sharpest is 2; calibrated: the planes' order, as told"
@@ -419,3 +424,14 @@ def test_short_fits_have_the_cameras_pixels_as_voxels(tmp_path, recorded):
     plain, camera = parts
     assert camera.grid == plain.grid
     assert torch.allclose(camera.data, plain.data, rtol=1e-5)
+
+
+def test_images_too_small_to_calibrate_by_are_refused(tmp_path, capsys):
+    write_stack(tmp_path / "stack.ome.tif", 900 + np.arange(24, dtype=np.uint16).reshape(2, 3, 2, 2), (0.2, 0.2), 1.2)
+    told = {**TOLD, "volume": {**TOLD["volume"], "shape": [8, 2, 2]}}
+    told["acquisition"] = {"focus": FOCUS, "prisms": prisms(0.2, 20, 1.3)}
+    (tmp_path / "run.toml").write_text(tomli_w.dumps(told), encoding="utf-8")
+    assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out")]) == 2
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.endswith("data.path: images of 2 × 2 pixels tell nothing of the optics; give 16 × 16 or more")
+    assert not (tmp_path / "out").exists()

@@ -130,9 +130,17 @@ def test_two_runs_in_one_folder_are_one_too_many(tmp_path, capsys, other_run):
     other_run.kill()
     other_run.wait()
     assert main([str(word) for word in command]) == 0
+    assert not (out / ".lock").exists()
     with folders_released():  # the command has released it
         hold(out)
         prepare_folder(out)  # and this one may hold it twice
+
+
+def test_a_run_that_is_going_on_is_not_called_interrupted(tmp_path, capsys, other_run):
+    (tmp_path / "in.toml").write_text(CONFIG)
+    (tmp_path / "out" / "checkpoint.pt").write_text("of the run that goes on")
+    line = said_no(capsys, "reconstruct", tmp_path / "in.toml", "--out", tmp_path / "out")
+    assert "another run is writing into it" in line
 
 
 def test_outside_a_command_nothing_is_held(tmp_path, other_run):

@@ -57,8 +57,10 @@ def test_prisms_and_planes_must_be_as_many_as_the_acquisition_says():
     stack = Stack(np.ones((3, 5, 4, 4), np.float32), source="stack.tif")
     with pytest.raises(StackError) as caught:
         prepared(stack, [1.0, -1.0], range(9), (0.1, 0.1))
-    assert str(caught.value) == "stack.tif holds 3 prisms × 5 planes, the acquisition says 2 × 9"
-    with pytest.raises(StackError, match="1 prism × 1 plane, the acquisition says 1 × 2"):
+    assert (
+        str(caught.value) == "stack.tif holds 3 prisms × 5 planes, acquisition.prisms and acquisition.focus say 2 × 9"
+    )
+    with pytest.raises(StackError, match=r"1 prism × 1 plane, acquisition\.prisms and acquisition\.focus say 1 × 2"):
         prepared(Stack(np.ones((1, 1, 4, 4), np.float32)), [None], [0.0, 1.0], (0.1, 0.1))
 
 

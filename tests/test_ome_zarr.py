@@ -155,6 +155,12 @@ def test_a_file_with_its_name_and_a_missing_one_are_refused(tmp_path):
         read_stack(tmp_path / "b.zarr")
 
 
+def test_an_empty_folder_with_its_name_is_refused(tmp_path):
+    (tmp_path / "a.zarr").mkdir()
+    with pytest.raises(StackError, match="holds nothing of Zarr's"):
+        read_stack(tmp_path / "a.zarr")
+
+
 def test_a_damaged_one_is_refused_in_a_line(tmp_path):
     path = by_hand(tmp_path / "a.zarr", counts(3, 5, 7), axes_of("zyx"), [1.0, 0.1, 0.1])
     (path / "0" / "0" / "0" / "0").write_bytes(b"short")

@@ -16,7 +16,7 @@ from recon.cli.own_stack.options import SEVERAL
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.terminal import write_plainly
 from recon.run.checkpoint import CheckpointError
-from recon.run.folder.lock import FolderInUseError, folders_released
+from recon.run.folder.lock import FolderInUseError, folders_released, hold
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
@@ -114,6 +114,7 @@ def main(typed: Sequence[str] | None = None) -> int:
     _show_each_warning_once()
     try:
         with folders_released():
+            _hold_folder(options)
             options.run(options)
     except (
         ConfigError,
@@ -134,6 +135,13 @@ def main(typed: Sequence[str] | None = None) -> int:
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
     return 0
+
+
+def _hold_folder(options: argparse.Namespace) -> None:
+    """Keep other runs out of the command's folder, where it is there already."""
+    out = getattr(options, "out", None)
+    if out is not None and out.is_dir():
+        hold(out)
 
 
 class _Parser(argparse.ArgumentParser):

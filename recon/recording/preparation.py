@@ -306,7 +306,7 @@ def check_counts(stack: Stack, expected: ExpectedStack) -> None:
     if held[:2] != (prisms, planes):
         raise StackError(
             f"{stack.source} holds {_counted(held[0], 'prism')} × {_counted(held[1], 'plane')}, "
-            f"the acquisition says {prisms} × {planes}"
+            f"acquisition.prisms and acquisition.focus say {prisms} × {planes}"
         )
     pixels = expected.pixels
     if pixels is not None and held[2:] != tuple(pixels):

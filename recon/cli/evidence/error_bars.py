@@ -1,6 +1,7 @@
 """torchdic error-bars: how far each voxel of a reconstruction, and the numbers of its parts, can be trusted."""
 
 import argparse
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from recon.cli.arguments import decimal
 from recon.config.schema import ConfigError
 from recon.evidence.bars import ErrorBars
 from recon.evidence.regions import INCREMENT, Known
-from recon.run.evidence.error_bars import DEVIATION, TOTAL, Wanted, error_bars
+from recon.report.verdict import PoorFitWarning
+from recon.run.evidence.error_bars import DEVIATION, TOTAL, Wanted, error_bars, poor_fit
 from recon.run.evidence.kept_refits import ERROR_BARS
 from recon.run.evidence.seen import what_lacks
 from recon.run.reconstruct import Reconstructed, reconstructed
@@ -49,6 +51,8 @@ def run(options: argparse.Namespace) -> None:
     outlines = dict(_outlines(options.regions, done)) if options.regions is not None else {}
     wanted = Wanted(options.refits, options.copies, options.increment, outlines)
     found, seen = error_bars(done, wanted, restart=options.restart)
+    if (words := poor_fit(done.out)) is not None:
+        warnings.warn(f"{words}. What is wrong with the model is in no bar", PoorFitWarning, stacklevel=1)
     print("\n".join(_words(found, done.config.volume.background)))
     if (lacks := what_lacks(done.config, seen)) is not None:
         print(lacks)

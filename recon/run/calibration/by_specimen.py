@@ -152,8 +152,7 @@ def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, 
     alone: whether the biases are known, so that all that is found is the length's.
     """
     config = stack.config
-    prisms = [prism for prism in config.acquisition.prisms if prism is not None]
-    told = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in prisms]
+    told = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in firsts_of(config.acquisition)]
     if len(config.acquisition.prisms) < 2:
         why = "one setting's images don't tell their differential part from a bright field's; use two, or a bead"
         return stack, [left(LENGTH, "µm", told, why)]
@@ -164,7 +163,7 @@ def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, 
         why = "volumes explain the images as well with other lengths; use a bead"
         return stack, [left(LENGTH, "µm", told, why + _hidden([found], beside))]
     how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
-    biases = [number(prism.bias) for prism in prisms]
+    biases = [number(prism.bias) for prism in config.acquisition.prisms if prism is not None]
     if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
         return stack, [_of_length(told, Shared(found.value, deviation, tuple(biases), ()), how)]

@@ -20,6 +20,9 @@ from recon.run.calibration.written import RESULTS, write_calibration
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 
+# Pixels along a side from which on images tell their background and their noise.
+LEAST_FIELD = 16
+
 # What no image tells, whatever is fitted.
 GAUGES = (
     "a Δn that is the same everywhere (the volume's background is as told)",
@@ -65,6 +68,9 @@ def calibrate(
     if section is not None:
         check_bead(config, section)
     stack = CalibrationStack.read(config, device)
+    if min(sides := stack.data.shape[2:]) < LEAST_FIELD:
+        pixels, least = (" × ".join(map(str, v)) for v in (sides, (LEAST_FIELD, LEAST_FIELD)))
+        raise ConfigError(f"data.path: images of {pixels} pixels tell nothing of the optics; give {least} or more")
     prepare_folder(out)
     orders = stack.orders(bounds_of(config))
     found = [_of_orders(orders, config)]

@@ -17,6 +17,9 @@ _PARTS = re.compile(r"(?P<setting>.*?)length (?P<length>.*); angle (?P<angle>.*)
 # Angles that differ by less, in degrees, are the same; and what parts a told value's origin from what agrees with it.
 SAME, AGREES = 1e-6, ", "
 
+# A length that changed by less than this share of it, as by rounding, stayed.
+STAYED = 1e-4
+
 _PRISMS, _FOCUS = "acquisition.prisms", "acquisition.focus"
 
 
@@ -80,7 +83,10 @@ def _of_prisms(declared: Acquisition, now: Acquisition, found: Mapping[str, Foun
         length, angle, bias = _polar(prism)
         parts = {}
         if (quantity := found.get("shear's length")) is not None:
-            parts["length"] = _calibrated(quantity.uncertainty[axis], length, " µm")
+            value, sure = quantity.value[axis], quantity.uncertainty[axis]
+            parts["length"] = _calibrated(sure, length, " µm")
+            if calibrated is not None and abs(_polar(calibrated)[0] / length - 1) < STAYED:
+                parts["length"] = f"{AGREES}calibrated: {value:.4g} ± {sure:.2g} µm agrees"
         if (quantity := found.get("shear's angle")) is not None:
             parts["angle"] = _calibrated(math.degrees(quantity.uncertainty[axis]), angle % 360, "°")
             if calibrated == prism and quantity.value[axis] != quantity.before[axis]:

@@ -1,9 +1,11 @@
 """The error bars of a finished reconstruction, from its folder back into it."""
 
 import hashlib
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool
@@ -28,6 +30,7 @@ from recon.run.folder.prepared import prepare_folder
 from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
 from recon.run.reconstruct import Reconstructed
+from recon.run.results import METRICS
 from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
@@ -83,6 +86,12 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
 def estimate_of(done: Reconstructed) -> Estimate:
     """A finished reconstruction as an estimate. Raises StackError where the noise of its stack isn't known."""
     return Estimate(done.problem, done.step, _noise_of(done), done.misfit, _solver(done))
+
+
+def poor_fit(out: Path) -> str | None:
+    """What a reconstruction's verdict says where its volume doesn't explain the stack; None where it does."""
+    verdict = json.loads((out / METRICS).read_text(encoding="utf-8"))["verdict"]
+    return str(verdict["words"]) if verdict["poor"] else None
 
 
 def _solver(done: Reconstructed) -> Callable[[Problem], Step]:

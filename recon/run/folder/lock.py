@@ -4,11 +4,13 @@ The system's lock on a file in the folder ends with the process that holds it, h
 """
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, Timeout
+
+from recon.config.schema import ConfigError
 
 LOCK = ".lock"
 
@@ -34,8 +36,8 @@ def folders_released() -> Iterator[None]:
 def hold(folder: Path) -> None:
     """Keep other runs out of a folder, which exists, until the command ends; outside a command nothing is held.
 
-    A command may hold a folder several times. Raises FolderInUseError where another run holds it, OSError where no file
-    can be made there.
+    A command may hold a folder several times. Raises FolderInUseError where another run holds it, ConfigError where no
+    file can be made there.
     """
     stack = _command.get()
     if stack is None:
@@ -46,4 +48,13 @@ def hold(folder: Path) -> None:
     except Timeout:
         told = f"{folder}: another run is writing into it; wait for its end, or name another folder"
         raise FolderInUseError(told) from None
-    stack.callback(lock.release)
+    except OSError as error:
+        raise ConfigError(f"{folder}: can't be written to: {error.strerror or error}") from error
+    stack.callback(_release, lock)
+
+
+def _release(lock: BaseFileLock) -> None:
+    if lock.lock_counter == 1:
+        with suppress(OSError):  # some systems don't remove a file that is open
+            Path(lock.lock_file).unlink()
+    lock.release()

@@ -60,7 +60,10 @@ def _read_series(path: Path, number: int | None = None) -> Stack:
 
 def _image(path: Path, number: int | None) -> Any:
     """The group of an image. Raises StackError where a folder holds several and none is chosen, or none."""
-    group = package("zarr", path, "zarr").open_group(str(path), mode="r")
+    zarr = package("zarr", path, "zarr")
+    if not is_zarr(path):
+        raise StackError(f"{path}: holds nothing of Zarr's: none of {', '.join(_MARKS)}")
+    group = zarr.open_group(str(path), mode="r")
     said = _said(group)
     if "multiscales" in said:
         images = [group]
