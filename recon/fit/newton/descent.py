@@ -260,16 +260,26 @@ class _Descent:
         (gradient,) = torch.autograd.grad(formed.misfit, formed.delta)
         return Judged(formed.value, gradient, formed.recorded.detach())
 
-    def renewed(self, place: Place, formed: Formed, draft: Fidelity, exact: Fidelity | None) -> tuple[Judged, Place]:
+    def corrected(self, place: Place, formed: Formed, exact: Fidelity) -> Correction:
+        """The correction of a place's images to those of the careful fidelity."""
+        return place.correction.renewed(self.placed(place), formed.images, exact, self.missed, self.size)
+
+    def renewed(
+        self,
+        place: Place,
+        formed: Formed,
+        draft: Fidelity,
+        exact: Fidelity | None,
+        correction: Correction | None = None,
+    ) -> tuple[Judged, Place]:
         """The misfit and its gradient of a place whose correction and nuisances are renewed before.
 
-        exact: the careful fidelity to which the images are corrected; None corrects nothing.
+        exact: the careful fidelity to which the images are corrected; None corrects nothing. correction: where it is
+        known already.
         """
         known = place
         if exact is not None:
-            setup = self.placed(place)
-            correction = place.correction.renewed(setup, formed.images, exact, self.missed, self.size)
-            place = replace(place, correction=correction)
+            place = replace(place, correction=correction or self.corrected(place, formed, exact))
         changed = False
         if self.nuisances and place.accepted > 0:
             place, changed = self.refined(place, formed.images.detach(), draft)
@@ -364,12 +374,17 @@ class _Descent:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
         place = replace(place, pairs=(), correction=Correction(), before=None, responding=place.parameters)
         hessian = self.responses(place.responding, draft, exact)
-        now, place = self.renewed(place, self.formed(place, draft), draft, exact)
-        if exact is not None and draft.sources < exact.sources and self.leads_astray(place.correction):
-            # the misfit is that of wrong images: until it falls no more, it says nothing of the priors
-            place, self.missed = replace(place, misled=True, correction=Correction(), before=math.inf), None
-            _, draft = drafts(exact, None)
-            now, place = self.renewed(place, self.formed(place, draft), draft, exact if exact != draft else None)
+        formed, known = self.formed(place, draft), None
+        if exact is not None:
+            known = self.corrected(place, formed, exact)
+            if draft.sources < exact.sources and self.leads_astray(known):
+                careful = known.to(formed.images.detach(), place.delta, self.missed)
+                # the misfit is that of wrong images: until it falls no more, it says nothing of the priors
+                place, self.missed = replace(place, misled=True, before=math.inf), None
+                _, draft = drafts(exact, None)
+                formed = self.formed(place, draft)
+                exact, known = (None, None) if exact == draft else (exact, Correction(careful - formed.images.detach()))
+        now, place = self.renewed(place, formed, draft, exact, known)
         return place, hessian, now
 
     def leads_astray(self, correction: Correction) -> bool:
