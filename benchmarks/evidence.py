@@ -107,8 +107,8 @@ def noise(options: argparse.Namespace) -> None:
         draws = Draws.of(name, options.cache)
         where = near(draws.scene.truth)
         found = []
-        for number in range(options.draws):
-            estimate = draws.estimate(draws.data(100 + number))
+        for number in range(options.first, options.first + options.draws):
+            estimate = draws.estimate(draws.data(number))
             setup = estimate.problem.setup
             bars = bars_of(estimate, list(refits(estimate, planned_refits(USUAL.noise, 0))), INCREMENT)
             off = (bars.delta - setup.within_field(estimate.refitted(draws.clean))).abs()
@@ -465,6 +465,7 @@ def _of_images(lines: list[str]) -> str:
 def draws_of_noise(parser: argparse.ArgumentParser) -> None:
     """What the table of noise's bars takes."""
     parser.add_argument("--draws", type=int, default=DRAWS, help="of noise")
+    parser.add_argument("--first", type=int, default=100, help="seed of the first")
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
