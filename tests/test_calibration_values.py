@@ -10,7 +10,6 @@ import recon.calibration.known_specimen as known
 from data_synthetic import Bead
 from recon.calibration.beside_volume import Beside, find_angles, find_images, find_length
 from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
-from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.length_and_bias import BIAS, LENGTH, Shared, shared
 from recon.calibration.levels import biases_of_levels
 from recon.calibration.optics import (
@@ -24,6 +23,7 @@ from recon.calibration.optics import (
 from recon.calibration.part import part_of
 from recon.calibration.trials.profile import FREEDOM, least_misfit
 from recon.fit.bounds import Bounds
+from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Recipe
 from recon.fit.setup import Setup
 from recon.misfit.gaussian import GaussianMisfit
@@ -122,7 +122,7 @@ def small_setup():
     )
     delta = 0.02 * torch.exp(-(z[:, None, None] ** 2 + (y[:, None] + 0.3) ** 2 + (x - 0.2) ** 2) / 0.5)
     microscope = Microscope(0.546, Objective(0.8), Condenser(0.5))
-    return UnevenSetup(Volume(GRID, delta, 1.4), microscope, Acquisition(PRISMS, (-0.4, 0.5)))
+    return Setup(Volume(GRID, delta, 1.4), microscope, Acquisition(PRISMS, (-0.4, 0.5)))
 
 
 UNKNOWNS = [

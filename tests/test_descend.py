@@ -339,7 +339,10 @@ def test_data_that_are_not_finite_do_not_pass_as_a_fit(truth, recipe):
         ({"tv": (1.0, math.inf)}, "tv inf must be at least 0"),
         ({"l1": -0.1}, "l1 -0.1 must be at least 0"),
         ({"draft_sources": 0}, "draft_sources 0 must be at least 1"),
-        ({"learn": ("colour",)}, "learn 'colour' must be one of 'brightness', 'bias', 'drift', 'focus', 'shear'"),
+        (
+            {"learn": ("colour",)},
+            "learn 'colour' must be one of 'brightness', 'bias', 'drift', 'lamp', 'focus', 'shear'",
+        ),
         ({"learn": ("bias", "bias")}, r"learn \['bias', 'bias'\] names one twice"),
     ],
 )

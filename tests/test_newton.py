@@ -15,7 +15,7 @@ from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.newton.correction import REST, Correction, drafts
 from recon.fit.newton.descent import COARSE_STEPS, CREEP, _Descent, minimise_by_newton
-from recon.fit.nuisances.brightness import Brightness
+from recon.fit.nuisances.light import Brightness
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.unknowns import IndexDifference, Unknown

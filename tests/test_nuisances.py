@@ -6,9 +6,9 @@ import torch
 
 from data_synthetic import GaussianBall
 from recon.fit.nuisances.bias import Bias, CommonBias
-from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
+from recon.fit.nuisances.light import Brightness, Lamp
 from recon.fit.nuisances.shear import ShearError
 from recon.fit.problem import Recipe
 from recon.fit.setup import Setup
@@ -20,7 +20,7 @@ GRID = Grid((8, 16, 18), (0.4, 0.2, 0.21))
 MICROSCOPE = Microscope(0.546, Objective(0.8), Condenser(0.5))
 ACQUISITION = Acquisition([Prism((0.05, 0.24), 1.3, 0.2), None, Prism((0.24, 0.0), -1.3)], [-0.7, 0.1, 0.9])
 FIDELITY = Fidelity(sources=3)
-ALL = [Brightness(), Drift(), Bias(), CommonBias(), FocusErrors(), ShearError()]
+ALL = [Brightness(), Drift(), Bias(), CommonBias(), FocusErrors(), ShearError(), Lamp()]
 NAMES = [type(unknown).__name__ for unknown in ALL]
 each = pytest.mark.parametrize("unknown", ALL, ids=NAMES)
 

@@ -12,9 +12,9 @@ from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.nuisances import refinement
 from recon.fit.nuisances.bias import Bias, CommonBias
-from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
+from recon.fit.nuisances.light import Brightness
 from recon.fit.nuisances.nearby import Nearby
 from recon.fit.nuisances.refinement import Beforehand, best_brightness, refined
 from recon.fit.nuisances.shear import ShearError

@@ -9,9 +9,9 @@ from data_synthetic import GaussianBall
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.nuisances.bias import Bias
-from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.focus import FocusErrors
+from recon.fit.nuisances.light import Brightness
 from recon.fit.nuisances.shear import ShearError
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium

@@ -19,8 +19,8 @@ from recon.calibration.part import Part
 from recon.calibration.trials.profile import Least, least_misfit
 from recon.calibration.trials.short_fits import last_step
 from recon.calibration.uncertainty import standard_deviations
-from recon.fit.nuisances.brightness import Brightness
 from recon.fit.nuisances.drift import Drift
+from recon.fit.nuisances.light import Brightness
 from recon.fit.nuisances.nearby import Nearby
 from recon.fit.nuisances.refinement import refined
 from recon.fit.problem import Problem, Recipe

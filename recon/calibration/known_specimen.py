@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
-from recon.calibration.lamp import Lamp, UnevenSetup
 from recon.calibration.optics import (
     Aberrations,
     CondenserAperture,
@@ -27,7 +26,7 @@ from recon.calibration.part import Part
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.base import Nuisance
 from recon.fit.nuisances.bias import Bias
-from recon.fit.nuisances.brightness import Brightness
+from recon.fit.nuisances.light import Brightness, Lamp
 from recon.fit.nuisances.nearby import Nearby, formed_together
 from recon.fit.nuisances.refinement import SCALE, refined
 from recon.fit.setup import Setup
@@ -94,7 +93,7 @@ def model_of(part: Part, specimen: ModelledSpecimen, background: float, microsco
     field = Grid((slabs, *part.grid.shape[1:]), (height / slabs, dy, dx))
     wide = field.widened(margin, margin)
     camera = Camera(pixel_size=dx) if math.isclose(dy, dx) else None
-    return UnevenSetup(
+    return Setup(
         Volume(wide, specimen.delta(wide).to(part.data), background),
         replace(microscope, camera=camera),
         Acquisition(),

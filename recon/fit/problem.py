@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from recon.fit.bounds import Bounds, SupportedBounds
-from recon.fit.nuisances.brightness import Brightness, RelativeBrightness
+from recon.fit.nuisances.light import Brightness, RelativeBrightness
 from recon.fit.nuisances.named import NUISANCES
 from recon.fit.planned import GivenFidelity, PlannedFidelity
 from recon.fit.setup import Setup

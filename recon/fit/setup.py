@@ -9,6 +9,9 @@ from torch import Tensor
 
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
 
+# Terms of the lamp's surface.
+TERMS = 5
+
 
 @dataclass(frozen=True, eq=False)
 class Setup:
@@ -17,11 +20,13 @@ class Setup:
     brightness: of each image (prism, focus), relative to what the model expects; None is 1.
     drift: of each image (prism, focus, 2), µm (y, x): a positive one moves the specimen's picture towards +y and +x.
     None is no drift.
+    lamp: coefficients (prism, 5) of a curved surface s: each prism's images are lit by 1 + s. Its terms are y, x, y²,
+    xy and x², each without its mean over the field; y and x run from −1 to 1. None is an even lamp.
     margin: voxels by which the volume is wider than the field of the images on each side. Where the specimen goes on
     beyond the field, a volume of the field's own size can't explain the images.
 
-    Brightness and drift may be learned. Raises ValueError where a shape isn't the acquisition's, or the margin is below
-    0 or leaves no field.
+    Brightness, drift and lamp may be learned. Raises ValueError where a shape isn't the acquisition's, or the margin is
+    below 0 or leaves no field.
     """
 
     volume: Volume
@@ -29,11 +34,13 @@ class Setup:
     acquisition: Acquisition
     brightness: Float[Tensor, "prism focus"] | None = None
     drift: Float[Tensor, "prism focus 2"] | None = None
+    lamp: Float[Tensor, "prism 5"] | None = None
     margin: int = 0
 
     def __post_init__(self) -> None:
         images = len(self.acquisition.prisms), len(self.acquisition.focus)
-        for name, value, expected in (("brightness", self.brightness, images), ("drift", self.drift, (*images, 2))):
+        given = ("brightness", self.brightness, images), ("drift", self.drift, (*images, 2))
+        for name, value, expected in (*given, ("lamp", self.lamp, (images[0], TERMS))):
             if value is not None and tuple(value.shape) != expected:
                 raise ValueError(f"the {name} has shape {tuple(value.shape)}, the acquisition asks for {expected}")
         sides = self.volume.grid.shape[1:]
@@ -97,10 +104,28 @@ class Setup:
         _, dy, dx = self.pixels.spacing
         images = data if self.drift is None else shifted(data, -self.drift, (dy, dx))
         images = images if self.sees_voxels else on_voxels(images, self.pixels, self.field)
-        return images if self.brightness is None else images / self.brightness.to(images)[..., None, None]
+        return images / self._light(images) if self.brightness is not None or self.lamp is not None else images
 
     def _lit(self, images: Tensor) -> Tensor:
-        return images if self.brightness is None else images * self.brightness.to(images)[..., None, None]
+        return images * self._light(images) if self.brightness is not None or self.lamp is not None else images
+
+    def _light(self, images: Tensor) -> Tensor:
+        """By what each pixel of the images is lit, relative to an even and steady lamp."""
+        light = images.new_ones(())
+        if self.brightness is not None:
+            light = light * self.brightness.to(images)[..., None, None]
+        if self.lamp is not None:
+            light = light * (1 + torch.einsum("pt,tyx->pyx", self.lamp.to(images), _surfaces(images)))[:, None]
+        return light
+
+
+def _surfaces(images: Tensor) -> Float[Tensor, "term y x"]:
+    """The lamp's terms on the pixels of images."""
+    ny, nx = images.shape[-2:]
+    y = torch.linspace(-1, 1, ny, dtype=images.dtype, device=images.device)[:, None].expand(ny, nx)
+    x = torch.linspace(-1, 1, nx, dtype=images.dtype, device=images.device).expand(ny, nx)
+    terms = torch.stack((y, x, y.square(), x * y, x.square()))
+    return terms - terms.mean((1, 2), keepdim=True)
 
 
 def empty_medium(grid: Grid, background: float, like: Tensor) -> Volume:

@@ -157,7 +157,7 @@ class Verdict:
             checked = ", ".join(self.assumed)
             return (
                 f"no single cause was found: check {f'what is assumed ({checked}), then ' if checked else ''}"
-                "pixel size, focus step, wavelength, apertures, shear and bias, and try learn = ['bias', 'drift']"
+                "pixel size, focus step, wavelength, apertures, shear, bias, and try learn = ['bias', 'drift', 'lamp']"
             )
         first, *others = self.causes
         named = f"; or {', '.join(dict.fromkeys(cause.name for cause in others[:2]))}" if others else ""

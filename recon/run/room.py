@@ -78,7 +78,12 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     few = replace(grid, shape=(grid.shape[0], *(min(n, SIDE) for n in grid.shape[1:])))
     medium = empty_medium(few, float(known.volume.background), torch.zeros((), dtype=dtype))
     microscope = stand_in(_of_one_source(known.microscope))
-    recording = {"brightness": stand_in(known.brightness), "drift": stand_in(known.drift), "margin": 0}
+    recording = {
+        "brightness": stand_in(known.brightness),
+        "drift": stand_in(known.drift),
+        "lamp": stand_in(known.lamp),
+        "margin": 0,
+    }
     setup = replace(known, volume=medium, microscope=microscope, acquisition=stand_in(known.acquisition), **recording)
     # values play no part, but images of one brightness are refused
     data = torch.rand(setup.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))

@@ -117,12 +117,16 @@ def _data(gathered: Gathered, found: Survey, settled: Settled, path: str, series
 
 
 def _reconstruction(gathered: Gathered, settled: Settled) -> list[Line]:
-    planes = gathered.stack.data.shape[1]
     bounds = {"lower": "none", "upper": 0.0} if settled.lower else {"lower": 0.0}
     said = "given" if settled.lower else "assumed"
     lines = [Line("bounds", bounds, f"{said}: Δn is {'below' if settled.lower else 'above'} 0")]
-    if planes > 1:
-        lines.append(Line("learn", ["drift"], "chosen: a slow drift can't be told from a change of focus beforehand"))
+    learned, why = [], []
+    if gathered.stack.data.shape[1] > 1:
+        learned, why = ["drift"], ["a slow drift can't be told from a change of focus beforehand"]
+    if gathered.stack.is_integer:
+        learned, why = [*learned, "lamp"], [*why, "the background that is divided out is fitted around the specimen"]
+    if learned:
+        lines.append(Line("learn", learned, f"chosen: {', and '.join(why)}"))
     return lines
 
 

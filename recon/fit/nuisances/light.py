@@ -1,11 +1,11 @@
-"""The brightness of each image: a lamp that isn't steady, or exposures that differ."""
+"""The light of the images: a lamp that isn't steady or even, or exposures that differ."""
 
 from dataclasses import dataclass, replace
 
 from torch import Tensor
 
 from recon.fit.nuisances.base import Nuisance
-from recon.fit.setup import Setup
+from recon.fit.setup import TERMS, Setup
 from recon.misfit.base import Misfit
 
 
@@ -50,3 +50,27 @@ class RelativeBrightness(Brightness):
     def told(self, parameter: Tensor) -> Tensor:
         """The logarithms without each prism's mean."""
         return parameter - parameter.mean(1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class Lamp(Nuisance):
+    """What is uneven of the light behind each prism (prism, 5), see `Setup.lamp`.
+
+    A background that was fitted around a specimen which fills much of the field is a little wrong, and divided out all
+    the same. learning_rate, step: of its coefficients.
+    """
+
+    learning_rate: float = 2e-3
+    step: float = 0.02
+    name = "lamp"
+    axes = ("prism",)
+    forms = False
+
+    def start(self, setup: Setup, misfit: Misfit) -> Tensor:
+        """The setup's lamp, or an even one."""
+        even = misfit.data.new_zeros(misfit.data.shape[0], TERMS)
+        return even if setup.lamp is None else setup.lamp.detach().to(even)
+
+    def put(self, value: Tensor, setup: Setup) -> Setup:
+        """The setup with this lamp."""
+        return replace(setup, lamp=value)
