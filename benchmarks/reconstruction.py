@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -102,21 +102,10 @@ def setup_of(scene: Scene, margin: int | None = None) -> Setup:
     return Setup(medium, scene.microscope, scene.acquisition, margin=margin)
 
 
-def fit(
-    scene: Scene,
-    recipe: Recipe | None = None,
-    fidelity: Fidelity | float | None = None,
-    setup: Setup | None = None,
-    mask: Tensor | None = None,
-    support: Tensor | None = None,
-) -> Found:
-    """Fit a scene by a recipe; None is the default one, at the recommended fidelity.
-
-    fidelity: or a tolerance, for which one is planned. mask: the pixels that count. support: the voxels in which Δn is
-        sought.
-    """
+def fit(scene: Scene, *asked: Any, **named: Any) -> Found:
+    """Fit a scene; arguments as of `problem_for`."""
     began = time.process_time()
-    problem = problem_for(scene, recipe, fidelity, setup, mask, support)
+    problem = problem_for(scene, *asked, **named)
     last = solved(problem)
     return Found(scene, last, problem.setup.within_field(last.delta), time.process_time() - began)
 
@@ -129,7 +118,11 @@ def problem_for(
     mask: Tensor | None = None,
     support: Tensor | None = None,
 ) -> Problem:
-    """What `fit` solves; arguments as its own."""
+    """The fit of a scene by a recipe; None is the default one, at the recommended fidelity.
+
+    fidelity: or a tolerance, for which one is planned. mask: the pixels that count. support: the voxels in which Δn is
+        sought.
+    """
     recipe = replace(recipe or Recipe(), bounds=Bounds(*scene.bounds))
     usual = RECOMMENDED if recipe.method == "newton" else RECOMMENDED_FOR_ADAM
     noise = measured_noise(scene.data, mask)

@@ -116,15 +116,7 @@ def main(typed: Sequence[str] | None = None) -> int:
         with folders_released():
             _hold_folder(options)
             options.run(options)
-    except (
-        ConfigError,
-        StackError,
-        CheckpointError,
-        FinishedError,
-        FolderInUseError,
-        ResultsError,
-        WriteError,
-    ) as error:
+    except WRONG as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)

@@ -1,6 +1,7 @@
 """What images are computed from: the specimen, the microscope, what was recorded, and how it was recorded."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -104,19 +105,21 @@ class Setup:
         _, dy, dx = self.pixels.spacing
         images = data if self.drift is None else shifted(data, -self.drift, (dy, dx))
         images = images if self.sees_voxels else on_voxels(images, self.pixels, self.field)
-        return images / self._light(images) if self.brightness is not None or self.lamp is not None else images
+        for light in self._lights(images):
+            images = images / light
+        return images
 
     def _lit(self, images: Tensor) -> Tensor:
-        return images * self._light(images) if self.brightness is not None or self.lamp is not None else images
+        for light in self._lights(images):
+            images = images * light
+        return images
 
-    def _light(self, images: Tensor) -> Tensor:
-        """By what each pixel of the images is lit, relative to an even and steady lamp."""
-        light = images.new_ones(())
+    def _lights(self, images: Tensor) -> Iterator[Tensor]:
+        """What multiplies the images' pixels, relative to an even and steady lamp."""
         if self.brightness is not None:
-            light = light * self.brightness.to(images)[..., None, None]
+            yield self.brightness.to(images)[..., None, None]
         if self.lamp is not None:
-            light = light * (1 + torch.einsum("pt,tyx->pyx", self.lamp.to(images), _surfaces(images)))[:, None]
-        return light
+            yield (1 + torch.einsum("pt,tyx->pyx", self.lamp.to(images), _surfaces(images)))[:, None]
 
 
 def _surfaces(images: Tensor) -> Float[Tensor, "term y x"]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.described.setup import StatedSetup, setup_in_words, setup_of_all
-from torchdic.files.extras.ome_zarr import is_zarr
 from torchdic.files.format import Stack
 from torchdic.files.joined import check_alike
 from torchdic.files.stack import FORMATS, format_of, read_stack
@@ -120,9 +119,7 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
     if len(paths) > 1:
         raise StackError(f"{folders[0]}: is a folder; give one folder, or files")
     suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
-    found = [file for file in folders[0].iterdir() if file.name.lower().endswith(suffixes) or is_zarr(file)]
-    found = [file for file in found if file.is_file() or format_of(file).folder]
-    found = [file for file in found if not file.name.startswith(".")]
+    found = [file for file in folders[0].iterdir() if _holds_images(file, suffixes) and not file.name.startswith(".")]
     if not found:
         others = sorted(file for file in folders[0].iterdir() if not file.name.startswith("."))
         for file in others:
@@ -132,6 +129,11 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
         holds = f"holds {others[0].name}{more}, but no images" if others else "is empty"
         raise StackError(f"{folders[0]}: {holds}; a folder of planes has files that end in {', '.join(suffixes)}")
     return tuple(sorted(found, key=lambda path: natural(path.name))), folders[0]
+
+
+def _holds_images(file: Path, suffixes: tuple[str, ...]) -> bool:
+    """Whether a file, or a folder of files, is in a format of images, by its name or as Zarr's."""
+    return format_of(file).folder if file.is_dir() else file.name.lower().endswith(suffixes) and file.is_file()
 
 
 def _setup(file: Path) -> StatedSetup:

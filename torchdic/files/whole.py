@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 
 class WriteError(OSError):
@@ -43,7 +42,7 @@ def folder_written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """As `written_whole`, for a folder: give an empty one beside `path`, which takes its place when the block ends."""
     path = Path(path)
     try:
-        with TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as beside:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as beside:
             partial, earlier = Path(beside) / path.name, Path(beside) / "earlier"
             partial.mkdir()
             yield partial

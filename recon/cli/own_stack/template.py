@@ -120,13 +120,13 @@ def _reconstruction(gathered: Gathered, settled: Settled) -> list[Line]:
     bounds = {"lower": "none", "upper": 0.0} if settled.lower else {"lower": 0.0}
     said = "given" if settled.lower else "assumed"
     lines = [Line("bounds", bounds, f"{said}: Δn is {'below' if settled.lower else 'above'} 0")]
-    learned, why = [], []
+    learned: dict[str, str] = {}
     if gathered.stack.data.shape[1] > 1:
-        learned, why = ["drift"], ["a slow drift can't be told from a change of focus beforehand"]
+        learned["drift"] = "a slow drift can't be told from a change of focus beforehand"
     if gathered.stack.is_integer:
-        learned, why = [*learned, "lamp"], [*why, "the background that is divided out is fitted around the specimen"]
+        learned["lamp"] = "the background that is divided out is fitted around the specimen"
     if learned:
-        lines.append(Line("learn", learned, f"chosen: {', and '.join(why)}"))
+        lines.append(Line("learn", list(learned), f"chosen: {', and '.join(learned.values())}"))
     return lines
 
 

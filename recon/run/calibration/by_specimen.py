@@ -57,9 +57,8 @@ def by_specimen(stack: CalibrationStack, known: set[str]) -> tuple[CalibrationSt
     beside = stack.beside()
     if not can_be_tried(beside.problem(beside.setup)):
         why = "no prism has a linear response, without which no volume can be fitted beside it"
-        return stack, [left(name, "", None, why) for name in (DIRECTION, "condenser na", LENGTH)] + _untold(
-            stack.config, known
-        )
+        untold = [left(name, "", None, why) for name in (DIRECTION, "condenser na", LENGTH)]
+        return stack, [*untold, *_untold(stack.config, known)]
     print("the shear's direction, the condenser's aperture and the shear's length, by volumes fitted with several …")
     beside = beside.held()
     stack, angles = _angles(stack, beside)
@@ -164,11 +163,11 @@ def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, 
         return stack, [left(LENGTH, "µm", told, why + _hidden([found], beside))]
     how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
     biases = [number(prism.bias) for prism in config.acquisition.prisms if prism is not None]
+    parts = Shared(found.value, deviation, tuple(biases), ())
     if abs(found.value) < AGREES * deviation:
         how += "; it agrees with what was told, which stays"
-        return stack, [_of_length(told, Shared(found.value, deviation, tuple(biases), ()), how)]
+        return stack, [_of_length(told, parts, how)]
     if alone:
-        parts = Shared(found.value, deviation, tuple(biases), ())
         return _with_prisms(stack, parts), [_of_length(told, parts, how)]
     parts = shared(found.value, deviation, biases)
     parts = replace(parts, biases=tuple(map(rounded_angle, parts.biases)))

@@ -27,6 +27,6 @@ def prepare_folder(out: Path) -> None:
         with written_whole(out / ".writable"):
             pass
         (out / ".writable").unlink()
-        hold(out)
     except OSError as error:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
+    hold(out)
