@@ -9,16 +9,13 @@ import numpy as np
 from recon.cli.own_stack.settled import Settled
 from recon.cli.own_stack.template import angle_in_words, name_of_setting
 from recon.config.commented import Sourced
-from recon.recording.survey.survey import Survey, shows_edges
+from recon.recording.survey.survey import SMALLEST, Survey, shows_edges
 from torchdic.files.gathered import Gathered
 
 Row = tuple[str, str, str]
 
 # Uneven light by more than this part of its mean, and planes whose brightness differs by more, are worth a word.
 _UNEVEN, _FLICKER = 0.3, 0.02
-
-# Pixels along a side of the smallest images that tell anything.
-_SMALLEST = 16
 
 # The background at bias 0 is below this part of the brightest edges.
 _DARK_FIELD = 0.25
@@ -127,10 +124,10 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
 def _too_little(gathered: Gathered, found: Survey) -> Iterator[str]:
     """Images that show no edges, or are too small to show them."""
     height, width = gathered.stack.data.shape[2:]
-    if min(height, width) < _SMALLEST:
+    if min(height, width) < SMALLEST:
         yield (
             f"warning: images of {height} × {width} pixels are too small to tell background, noise and shear: of at "
-            f"least {_SMALLEST} × {_SMALLEST} they can be told"
+            f"least {SMALLEST} × {SMALLEST} they can be told"
         )
     elif not shows_edges(found):
         yield (

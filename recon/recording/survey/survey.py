@@ -22,6 +22,9 @@ _ALWAYS, _ALONE = 0.9, 0.5
 # Pixels along a side of the square that holds a pixel's neighbours.
 _NEIGHBOURS = 5
 
+# Pixels along a side of the smallest images that tell anything.
+SMALLEST = 16
+
 
 @dataclass(frozen=True, eq=False)
 class SettingSurvey:

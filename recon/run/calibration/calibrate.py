@@ -11,6 +11,7 @@ from recon.calibration.trials.orders import Orders
 from recon.config.rewritten import Source
 from recon.config.schema import BeadSection, Config, ConfigError
 from recon.fit.bounds import Bounds
+from recon.recording.survey.survey import SMALLEST
 from recon.run.calibration.by_bead import by_bead, check_bead
 from recon.run.calibration.by_levels import by_levels
 from recon.run.calibration.by_specimen import by_specimen
@@ -19,9 +20,6 @@ from recon.run.calibration.stack import CalibrationStack
 from recon.run.calibration.written import RESULTS, write_calibration
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
-
-# Pixels along a side from which on images tell their background and their noise.
-LEAST_FIELD = 16
 
 # What no image tells, whatever is fitted.
 GAUGES = (
@@ -68,8 +66,8 @@ def calibrate(
     if section is not None:
         check_bead(config, section)
     stack = CalibrationStack.read(config, device)
-    if min(sides := stack.data.shape[2:]) < LEAST_FIELD:
-        pixels, least = (" × ".join(map(str, v)) for v in (sides, (LEAST_FIELD, LEAST_FIELD)))
+    if min(sides := stack.data.shape[2:]) < SMALLEST:
+        pixels, least = (" × ".join(map(str, v)) for v in (sides, (SMALLEST, SMALLEST)))
         raise ConfigError(f"data.path: images of {pixels} pixels tell nothing of the optics; give {least} or more")
     prepare_folder(out)
     orders = stack.orders(bounds_of(config))
