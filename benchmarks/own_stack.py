@@ -74,7 +74,7 @@ def journey(seed: int, out: Path, *, bead: bool) -> str:
         written = new(made, recording, out, "run")
         values = typed(written, told)
         if bead:
-            values["acquisition"]["prisms"] = by_bead(made, out)
+            by_bead(values, made, out)
         path = saved(values, out / "typed.toml")
         ran("calibrate", path, "--out", out / "calibration", "--restart")
         ran("reconstruct", out / "calibration" / "calibrated.toml", "--out", out / "volume", "--restart")
@@ -109,17 +109,19 @@ def typed(written: dict[str, Any], told: Told) -> dict[str, Any]:
     return values
 
 
-def by_bead(made: Drawn, out: Path) -> list[dict[str, Any]]:
-    """The prisms that `torchdic calibrate` finds from a stack of a bead by the same microscope."""
+def by_bead(values: dict[str, Any], made: Drawn, out: Path) -> None:
+    """Put in the prisms that `torchdic calibrate` finds from a stack of a bead by the same microscope."""
     recording = made.recording
     field = recording.field
     middle = float(np.mean([float(z) for z in recording.acquisition.focus]))
     specimen = Bead(RADIUS, CONTRAST, OIL, (middle, 0.1, -0.2))
     seen = record(specimen, field, recording.microscope, recording.acquisition, recording.faults, seed=1)
-    values = typed(new(made, seen, out, "bead"), replace(made.told, background=OIL, lower=False))
-    values["calibration"] = {"bead": {"radius": RADIUS, "index": OIL + CONTRAST}}
-    ran("calibrate", saved(values, out / "bead_typed.toml"), "--out", out / "bead", "--restart")
-    return prisms_and_focus(out / "bead")[0]
+    of_bead = typed(new(made, seen, out, "bead"), replace(made.told, background=OIL, lower=False))
+    of_bead["calibration"] = {"bead": {"radius": RADIUS, "index": OIL + CONTRAST}}
+    ran("calibrate", saved(of_bead, out / "bead_typed.toml"), "--out", out / "bead", "--restart")
+    found = tomllib.loads((out / "bead" / "microscope.toml").read_text(encoding="utf-8"))
+    values["acquisition"]["prisms"] = found["acquisition"]["prisms"]
+    values["calibration"] = found["calibration"]
 
 
 def prisms_and_focus(calibration: Path) -> tuple[list[dict[str, Any]], list[float]]:

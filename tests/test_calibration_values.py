@@ -9,8 +9,9 @@ import torch
 import recon.calibration.known_specimen as known
 from data_synthetic import Bead
 from recon.calibration.beside_volume import Beside, find_angles, find_images, find_length
+from recon.calibration.foreknowledge import Foreknowledge, most_probable
 from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
-from recon.calibration.length_and_bias import BIAS, LENGTH, Shared, shared
+from recon.calibration.length_and_bias import Shared, shared
 from recon.calibration.levels import biases_of_levels
 from recon.calibration.optics import (
     Aberrations,
@@ -285,10 +286,14 @@ def test_two_settings_tell_the_product_of_length_and_slope(longer, more):
     assert abs(found.value - expected) < 3 * math.hypot(found.deviation, found.unexplained)
 
 
+KNOWN = Foreknowledge.within(0.15, rad(10), rad(10))
+
+
 @pytest.mark.parametrize("change", [-0.2, 0.1])
 @pytest.mark.parametrize("biases", [(1.2, -1.2), (0.5, 2.0), (1.2 + 2 * math.pi, -0.3), (-2.9,)])
 def test_length_and_bias_share_what_their_product_changes_by(biases, change):
-    found = shared(change, 0.0, biases)
+    found = shared(change, 0.0, biases, KNOWN)
+    assert found.change == change
     for before, after in zip(biases, found.biases, strict=True):
         slopes = [1 / math.tan(abs(math.remainder(bias, 2 * math.pi)) / 2) for bias in (before, after)]
         assert found.length + math.log(slopes[1] / slopes[0]) == pytest.approx(change)
@@ -296,20 +301,69 @@ def test_length_and_bias_share_what_their_product_changes_by(biases, change):
     assert 0 < found.length / change < 1
 
 
+def test_length_and_bias_are_the_most_probable_ones():
+    """No other pair is more probable, to first order in the change of the bias."""
+    change, deviation, bias = 0.02, 0.07, rad(65)
+
+    def improbable(length: float, more: float) -> float:
+        rest = change - length + more / math.sin(bias)
+        return (rest / deviation) ** 2 + (length / KNOWN.length) ** 2 + (more / KNOWN.bias) ** 2
+
+    found = shared(change, deviation, [bias], KNOWN)
+    least = improbable(found.length, found.biases[0] - bias)
+    for length, more in ((2e-3, 0.0), (-2e-3, 0.0), (0.0, 2e-3), (0.0, -2e-3)):
+        assert improbable(found.length + length, found.biases[0] - bias + more) > least
+    # and their deviations are what the curvature of it says
+    curvature = torch.autograd.functional.hessian(
+        lambda x: (
+            ((change - x[0] + x[1] / math.sin(bias)) / deviation).square() / 2
+            + (x[0] / KNOWN.length).square() / 2
+            + (x[1] / KNOWN.bias).square() / 2
+        ),
+        torch.zeros(2, dtype=torch.float64),
+    )
+    variances = torch.linalg.inv(curvature).diagonal().sqrt().tolist()
+    assert [found.length_deviation, *found.bias_deviations] == pytest.approx(variances)
+
+
+def test_what_images_tell_is_weighed_against_what_was_known():
+    """Halfway where both are known alike; what is known exactly stays, and so does what the images don't tell."""
+    assert most_probable(0.2, 0.1, 0.1) == pytest.approx((0.1, 0.1 / math.sqrt(2)))
+    assert most_probable(0.2, 0.0, 0.1) == (0.2, 0.0)
+    assert most_probable(0.2, 0.1, 0.0) == (0.0, 0.0)
+    assert most_probable(0.0, math.inf, 0.1) == (0.0, 0.1)
+
+
 def test_the_more_uncertain_of_length_and_bias_takes_the_larger_part():
     """At 90° 10° are a change of the product by 17 %, at 30° by 35 %."""
-    assert shared(0.1, 0.0, [math.pi / 2]).length == pytest.approx(0.1 * 0.15**2 / (0.15**2 + rad(10) ** 2))
-    parts = [shared(0.1, 0.0, [rad(bias)]).length for bias in (90, 60, 30, 10)]
+    part = shared(0.1, 0.0, [math.pi / 2], KNOWN).length
+    assert part == pytest.approx(0.1 * 0.15**2 / (0.15**2 + rad(10) ** 2))
+    parts = [shared(0.1, 0.0, [rad(bias)], KNOWN).length for bias in (90, 60, 30, 10)]
     assert parts == sorted(parts, reverse=True)
     # without a differential part there is nothing that the bias could take
-    assert shared(0.1, 0.05, [math.pi]) == Shared(0.1, 0.05, (math.pi,), (BIAS,))
+    exact = Foreknowledge(0.1, 0.2, 0.1)
+    assert shared(0.1, 0.0, [math.pi], exact) == Shared(0.1, 0.1, 0.0, (math.pi,), (0.2,))
+
+
+def test_what_is_known_beforehand_stays():
+    """A bias that is known stays and the length takes all; where both are, nothing changes."""
+    bias_known = shared(0.1, 0.0, [1.2], Foreknowledge(0.1, 0.0, 0.1))
+    assert bias_known.length == pytest.approx(0.1)
+    assert bias_known.biases == (1.2,)
+    assert shared(0.1, 0.05, [1.2], Foreknowledge(0.0, 0.0, 0.1)) == Shared(0.0, 0.0, 0.0, (1.2,), (0.0,))
+    length_known = shared(0.1, 0.05, [1.2], Foreknowledge(0.0, 0.1, 0.1))
+    assert (length_known.length, length_known.length_deviation) == (0.0, 0.0)
+    assert length_known.biases[0] < 1.2
+    # what the images hardly tell changes hardly anything
+    assert shared(0.1, 10.0, [1.2], KNOWN).change < 1e-4
 
 
 def test_what_the_product_does_not_tell_stays_unsure():
-    exact, unsure = (shared(0.1, deviation, [1.2]) for deviation in (0.0, 10.0))
-    assert 0.5 * LENGTH < exact.length_deviation < LENGTH
-    assert 0.5 * BIAS < exact.bias_deviations[0] < BIAS
-    assert unsure.length_deviation > 10 * LENGTH
+    exact, unsure = (shared(0.1, deviation, [1.2], KNOWN) for deviation in (0.0, 100.0))
+    assert 0.5 * KNOWN.length < exact.length_deviation < KNOWN.length
+    assert 0.5 * KNOWN.bias < exact.bias_deviations[0] < KNOWN.bias
+    assert unsure.length_deviation == pytest.approx(KNOWN.length, rel=1e-4)
+    assert unsure.bias_deviations[0] == pytest.approx(KNOWN.bias, rel=1e-4)
 
 
 @pytest.mark.parametrize(("drift", "noise"), [(0.1, 0.004), (0.0, 0.02), (0.1, 0.02)])

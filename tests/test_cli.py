@@ -485,3 +485,17 @@ def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, mor
     assert len(dark) == 1
     assert "objective NA 1.4" in dark[0]
     assert "condenser NA 1.4" in dark[0]
+
+
+def test_ctrl_c_while_torch_is_loaded_ends_in_one_line(monkeypatch, capsys):
+    class Stops:
+        """Stands for an import that is interrupted."""
+
+        def find_spec(self, name, path=None, target=None):
+            if name == "recon.cli.commands":
+                raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "recon.cli.commands", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Stops(), *sys.meta_path])
+    assert main(["demo", "--out", "somewhere"]) == 130
+    assert capsys.readouterr().err == "torchdic: error: interrupted\n"

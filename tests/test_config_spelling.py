@@ -69,6 +69,25 @@ def test_the_resolved_configuration_has_canonical_keys_alone(write):
     assert "#" not in resolved
 
 
+def test_how_closely_angles_are_known_may_be_given_in_degrees(write):
+    known = load(write(text() + "[calibration]\nbias_within_degrees = 3\nangle_within = 0.02\n")).calibration
+    assert (known.bias_within, known.angle_within) == (pytest.approx(math.radians(3)), 0.02)
+
+
+@pytest.mark.parametrize(
+    ("section", "law"),
+    [
+        ("bias_within = 10", "bias_within 10 rad must be within 0 and π/2; bias_within_degrees is in °"),
+        ("angle_within_degrees = 100", "angle_within 1.74533 rad must be within 0 and π/2"),
+        ("length_within = 15", "length_within 15 must be a share from 0 to below 1; 0.1 is 10 %"),
+        ("bias_within = 0.1\nbias_within_degrees = 6", "calibration.bias_within and calibration.bias_within_degrees"),
+        ("bias_within_degree = 6", "unknown key calibration.bias_within_degree; did you mean 'bias_within_degrees'?"),
+    ],
+)
+def test_how_closely_prisms_are_known_has_limits(write, section, law):
+    assert law in the_error(write(f"{text()}[calibration]\n{section}\n"))
+
+
 @pytest.mark.parametrize(
     ("degrees", "y", "x"), [(0, 0, 1), (90, 1, 0), (180, 0, -1), (-90, -1, 0), (45, 0.5**0.5, 0.5**0.5)]
 )

@@ -83,6 +83,7 @@ def test_what_cannot_be_is_refused_with_its_key_and_value(tmp_path, changes, mes
         {"microscope__wavelength": 2.0, "volume__background": 4.05, "calibration": {}},  # germanium
         {"volume__spacing": [0.4, 0.0325, 0.0325], "microscope__objective": {"na": 1.4}},
         {"microscope__condenser": {"na": 0.9}},
+        {"microscope__condenser": {"na": 0.0}},
     ],
 )
 def test_what_microscopists_use_is_neither_refused_nor_warned_of(changes):
@@ -97,6 +98,7 @@ def test_what_microscopists_use_is_neither_refused_nor_warned_of(changes):
         ({"microscope__wavelength": 1.3, "volume__background": 4.8, "calibration": {}}, "volume.background: 4.8"),
         ({"microscope__wavelength": 5.46}, "microscope.wavelength: 5.46 µm is likely wrong"),
         ({"microscope__objective": {"na": 0.08}, "microscope__condenser": {"na": 0.05}}, "objective.na: 0.08"),
+        ({"microscope__condenser": "none"}, "microscope.condenser: none is likely wrong: all light would come along"),
         ({"microscope__condenser": {"na": 1.3}}, "microscope.condenser.na: 1.3 is above microscope.objective.na 0.9"),
         (
             {"volume__spacing": [0.4, 1.6, 1.6]},

@@ -197,9 +197,9 @@ def _images_found(beside: Beside) -> tuple[dict[str, Tensor], dict[str, Tensor],
     """The parameters of brightness and drift, their deviations beside the volume, and the priors' last weight."""
     problem = beside.problem(beside.setup)
     last = beside.last(replace(problem, unknowns=[*problem.unknowns, Drift()]))
-    index = next(u for u in problem.unknowns if u.name == "delta")
     unknowns = [Brightness(), Drift()]
-    setup = index.put(last.values["delta"], beside.setup)
+    others = [u for u in problem.unknowns if u.name != Brightness.name]
+    setup = with_values(others, last.values, beside.setup)
     parameters = {"brightness": last.values["brightness"].log(), "drift": last.values["drift"]}
     fidelity = Fidelity("wave", sources=beside.sources)
     parameters = refined(unknowns, parameters, setup, problem.misfit, fidelity)

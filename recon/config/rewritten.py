@@ -42,6 +42,10 @@ class Source:
         """The same, without a table."""
         return replace(self, values={name: value for name, value in self.values.items() if name != section})
 
+    def with_comments(self, comments: Mapping[str, str]) -> "Source":
+        """The same, with other comments."""
+        return replace(self, comments=comments)
+
 
 def rewritten(
     config: Config, folder: Path, source: Source, comments: Mapping[str, str], head: Sequence[str] = ()
@@ -61,10 +65,19 @@ def rewritten(
 
 
 def rewritten_microscope(config: Config, source: Source, comments: Mapping[str, str], head: Sequence[str] = ()) -> str:
-    """The microscope and the prisms as `rewritten`, to be included by the configurations of other stacks."""
+    """The microscope, the prisms and how closely they are known, to be included by the configurations of other stacks.
+
+    config, source, comments, head: as of `rewritten`.
+    """
     values = _spelled(config, source.values)
     prisms = [_prism(prism) for prism in config.acquisition.prisms]
     kept = {"microscope": values["microscope"], "acquisition": {"prisms": prisms}}
+    known = config.calibration
+    kept["calibration"] = {
+        "length_within": _round(known.length_within),
+        "bias_within_degrees": _round(math.degrees(known.bias_within)),
+        "angle_within_degrees": _round(math.degrees(known.angle_within)),
+    }
     return _text(kept, source, comments, head)
 
 
@@ -137,7 +150,7 @@ def _prism(prism: Prism | None, was: Any = None) -> Any:
         return {BRIGHT_FIELD: True, **where} if where else BRIGHT_FIELD
     y, x = map(number, prism.shear)
     angle = math.degrees(math.atan2(y, x))
-    told: Table = {"shear": {"length": _round(math.hypot(y, x)), "angle_degrees": _round(angle) % 360}}
+    told: Table = {"shear": {"length": _round(math.hypot(y, x)), "angle_degrees": _round(angle % 360)}}
     told["bias_degrees"] = _round(math.degrees(number(prism.bias)))
     if prism.axis is not None:
         told["axis_degrees"] = _round(math.degrees(number(prism.axis)))

@@ -216,15 +216,26 @@ class CalibrationSection:
     aberrations: Noll indices of the objective's Zernike terms that are sought with a bead.
     one_exposure: whether all prism settings were recorded with one lamp, exposure and gain, so that the levels of their
         backgrounds tell of their biases.
-    Raises ValueError for a Noll index below 4, which a picture doesn't show, or named twice, and for aberrations
-    without a bead.
+    length_within, bias_within, angle_within: how closely the shear's length is known beforehand, as a share of it, the
+        bias, and the shear's direction, in rad (bias_within_degrees, angle_within_degrees in a file): what the images
+        of an unknown specimen tell is weighed against it.
+    Raises ValueError for a length_within, bias_within or angle_within out of range, for a Noll index below 4, which a
+        picture doesn't show, or named twice, and for aberrations without a bead.
     """
 
     bead: BeadSection | None = None
     aberrations: tuple[int, ...] = ()
     one_exposure: bool = False
+    length_within: float = 0.15
+    bias_within: float = math.radians(10)
+    angle_within: float = math.radians(10)
 
     def __post_init__(self) -> None:
+        if not 0 <= self.length_within < 1:
+            raise ValueError(f"length_within {self.length_within:g} must be a share from 0 to below 1; 0.1 is 10 %")
+        for name in ("bias_within", "angle_within"):
+            if not 0 <= (angle := getattr(self, name)) <= math.pi / 2:
+                raise ValueError(f"{name} {angle:g} rad must be within 0 and π/2; {name}_degrees is in °")
         for term in self.aberrations:
             if term < 4:
                 raise ValueError(f"aberrations {term}: piston and tilts (Noll 1 to 3) don't show; 5 and above do")

@@ -18,6 +18,9 @@ ANGLES = ("bias", "polariser", "axis", "wedge")
 # What is appended to an angle's key where it is in degrees.
 DEGREES = "_degrees"
 
+# How closely angles are known, in rad, each of which may be given in degrees.
+_WITHIN = ("bias_within", "angle_within")
+
 # The keys of a layer that name its media, and what each stands for.
 _OF_LAYERS = {"depth": "thickness", "medium": "index", "design": "design_index"}
 
@@ -30,6 +33,7 @@ FURTHER: dict[str, tuple[str, ...]] = {
     "CompensatorSection": _OF_PRISMS,
     "WedgeSection": _OF_PRISMS,
     "Layer": tuple(_OF_LAYERS),
+    "CalibrationSection": tuple(f"{angle}{DEGREES}" for angle in _WITHIN),
 }
 
 # Sets of keys that exclude each other because they say the same, by the key of their table.
@@ -60,6 +64,8 @@ def canonical(values: Mapping[str, Any]) -> Table:
     if isinstance(known.get("volume"), dict):
         known["volume"] = _volume(known["volume"])
     known = _with_layer(known)
+    if isinstance(known.get("calibration"), dict):
+        known["calibration"] = _in_rad(known["calibration"], "calibration", _WITHIN)
     if isinstance(known.get("acquisition"), dict):
         known["acquisition"] = _acquisition(known["acquisition"])
         if isinstance(known["acquisition"].get("prisms"), list):
@@ -154,14 +160,7 @@ def _prism(table: Table, key: str) -> Table | str:
     """A prism with its shear as (y, x) and its angles in rad; bright field by its name."""
     if table == {BRIGHT_FIELD: True}:
         return BRIGHT_FIELD
-    changed = dict(table)
-    for angle in ANGLES:
-        named = f"{angle}{DEGREES}"
-        if named not in table:
-            continue
-        if angle in table:
-            raise ValueError(f"{key}.{angle} and {key}.{named} say the same: leave one out")
-        changed[angle] = math.radians(_number(changed.pop(named), f"{key}.{named}"))
+    changed = _in_rad(table, key, ANGLES)
     if isinstance(table.get("shear"), dict):
         parts = _parts(table["shear"], f"{key}.shear", ("length", "angle_degrees"))
         length, degrees = (
@@ -169,6 +168,19 @@ def _prism(table: Table, key: str) -> Table | str:
             for name, value in zip(("length", "angle_degrees"), parts, strict=True)
         )
         changed["shear"] = list(direction(length, degrees))
+    return changed
+
+
+def _in_rad(table: Table, key: str, angles: Iterable[str]) -> Table:
+    """A table with those of its angles that are given in degrees in rad. key: of the table."""
+    changed = dict(table)
+    for angle in angles:
+        named = f"{angle}{DEGREES}"
+        if named not in table:
+            continue
+        if angle in table:
+            raise ValueError(f"{key}.{angle} and {key}.{named} say the same: leave one out")
+        changed[angle] = math.radians(_number(changed.pop(named), f"{key}.{named}"))
     return changed
 
 

@@ -81,6 +81,11 @@ def _light(config: Config) -> Iterator[str]:
 
 def _apertures(config: Config) -> Iterator[str]:
     objective, condenser = config.microscope.objective, config.microscope.condenser
+    if config.data is not None and condenser is None:
+        yield (
+            "microscope.condenser: none is likely wrong: all light would come along the axis; DIC's condensers are "
+            "opened to 0.6 to 1 times the objective's NA (condenser = { na = 0 } says that it is shut)"
+        )
     if objective is None:
         return
     if objective.na < _LEAST_NA:

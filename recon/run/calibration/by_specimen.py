@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images, find_length
+from recon.calibration.foreknowledge import Foreknowledge, most_probable
 from recon.calibration.length_and_bias import Shared, shared
 from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
@@ -29,7 +30,7 @@ from torchdic.scalar import number
 PLANES = 15
 
 # An angle, and the logarithms of an aperture and a length, that are as uncertain as this aren't told.
-UNSURE_ANGLE, UNSURE_APERTURE, UNSURE_LENGTH = math.radians(5), 0.1, 0.15
+UNSURE_ANGLE, UNSURE_APERTURE, UNSURE_LENGTH = math.radians(10), 0.1, 0.15
 
 # Where the best volume leaves more than this many times what noise does, and this share of the contrast, what it
 # doesn't explain would be put down to the aperture.
@@ -39,9 +40,9 @@ POOR, LEAST = 1.3, 0.03
 # scenes.
 MODEL_APERTURE, MODEL_LENGTH, MODEL_ANGLE = 0.05, 0.05, math.radians(0.5)
 
-# A value within so many standard deviations of what was told agrees with it. Dim specimens tell little of aperture and
-# length, and priors move them: more is asked of them.
-AGREES_ANGLE, AGREES = 2.0, 3.0
+# An aperture within so many standard deviations of what was told agrees with it: dim specimens tell little of it, and
+# priors move it.
+AGREES = 3.0
 
 # A drift of which an image's is so many standard deviations from 0 shows: there are a hundred of them in a stack.
 SHOWS = 4.0
@@ -93,30 +94,29 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
     found = find_angles(beside)
     told = [math.atan2(number(p.shear[0]), number(p.shear[1])) for p in firsts_of(config.acquisition)]
     name, unit = DIRECTION, "rad"
-    if max(least.deviation for least in found) > UNSURE_ANGLE:
+    deviations = [math.hypot(least.deviation, MODEL_ANGLE) for least in found]
+    if max(deviations) > UNSURE_ANGLE:
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
         return stack, left(name, unit, told, why + _hidden(found, beside))
-    deviations = [math.hypot(least.deviation, MODEL_ANGLE) for least in found]
-    values = [rounded(t + least.value, 5) for t, least in zip(told, found, strict=True)]
-    sure = [rounded(deviation, 2) for deviation in deviations]
-    how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; from right towards down"
-    off = [abs(least.value) >= AGREES_ANGLE * deviation for least, deviation in zip(found, deviations, strict=True)]
-    if not any(off):
-        how += "; it agrees with what was told, which stays"
-        return stack, FoundQuantity(name, unit, told, values, sure, how)
-    if not all(off):
-        how += "; an axis that agrees with what was told stays as it was"
-    # a value that agrees is no better known than the told one, and priors move it
-    turns = [least.value if is_off else 0.0 for least, is_off in zip(found, off, strict=True)]
+    known = _known(config).angle
+    values = [most_probable(least.value, each, known) for least, each in zip(found, deviations, strict=True)]
+    turns, sure = zip(*values, strict=True)
+    by_images = ", ".join(map(_off, found, deviations))
+    how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; the images put it {by_images} "
+    how += f"from what was told, which is known to {math.degrees(config.calibration.angle_within):.2g}°; "
+    how += "from right towards down"
     unknown = ShearOfAxes(axes_of(config.acquisition))
     turned = torch.tensor([[1.0, turn] for turn in turns], dtype=torch.float64)
     made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
-    prisms = [
-        rounded_shear(new) if new is not None and off[axis] else old
-        for new, old, axis in zip(made.prisms, config.acquisition.prisms, axes_of(config.acquisition), strict=True)
-    ]
+    prisms = [prism if prism is None else rounded_shear(prism) for prism in made.prisms]
     calibrated = replace(config, acquisition=replace(made, prisms=prisms))
-    return stack.with_config(calibrated), FoundQuantity(name, unit, told, values, sure, how)
+    values = [rounded(t + turn, 5) for t, turn in zip(told, turns, strict=True)]
+    quantity = FoundQuantity(name, unit, told, values, [rounded(deviation, 2) for deviation in sure], how)
+    return stack.with_config(calibrated), quantity
+
+
+def _off(least: Least, deviation: float) -> str:
+    return f"{math.degrees(least.value):+.1f}° ± {math.degrees(deviation):.1f}°"
 
 
 def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, list[FoundQuantity]]:
@@ -148,7 +148,7 @@ def _aperture(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack
 def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, list[FoundQuantity]]:
     """The shear's length, of all settings alike, and the biases: where two settings tell an image's differential part.
 
-    alone: whether the biases are known, so that all that is found is the length's.
+    alone: whether the biases are known by other means, so that all that is found is the length's.
     """
     config = stack.config
     told = [math.hypot(number(p.shear[0]), number(p.shear[1])) for p in firsts_of(config.acquisition)]
@@ -161,20 +161,31 @@ def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, 
     if deviation > UNSURE_LENGTH:
         why = "volumes explain the images as well with other lengths; use a bead"
         return stack, [left(LENGTH, "µm", told, why + _hidden([found], beside))]
-    how = f"with the biases as told: volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}"
     biases = [number(prism.bias) for prism in config.acquisition.prisms if prism is not None]
-    parts = Shared(found.value, deviation, tuple(biases), ())
-    if abs(found.value) < AGREES * deviation:
-        how += "; it agrees with what was told, which stays"
-        return stack, [_of_length(told, parts, how)]
+    known = _known(config)
+    parts = shared(found.value, deviation, biases, replace(known, bias=0.0) if alone else known)
+    how = f"volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}; {_weighed(found, deviation)}; "
+    how += f"with the length known to {config.calibration.length_within:.2g} of it"
     if alone:
-        return _with_prisms(stack, parts), [_of_length(told, parts, how)]
-    parts = shared(found.value, deviation, biases)
+        return _with_prisms(stack, parts), [_of_length(told, parts, f"{how} {_probable(parts)}")]
     parts = replace(parts, biases=tuple(map(rounded_angle, parts.biases)))
-    how += f"; length/tan(bias/2) changes by {math.expm1(found.value):+.1%}, which length and bias share"
+    how += f" and the bias to {math.degrees(config.calibration.bias_within):.2g}° {_probable(parts)}"
     values, unsure = ([rounded(v, n) for v in part] for part, n in ((parts.biases, 5), (parts.bias_deviations, 2)))
     bias = FoundQuantity("bias", "rad", biases, values, unsure, f"{PRODUCT}; see its length")
     return _with_prisms(stack, parts), [_of_length(told, parts, how), bias]
+
+
+def _known(config: Config) -> Foreknowledge:
+    known = config.calibration
+    return Foreknowledge.within(known.length_within, known.bias_within, known.angle_within)
+
+
+def _weighed(found: Least, deviation: float) -> str:
+    return f"the images put length/tan(bias/2) {math.expm1(found.value):+.1%} ± {deviation:.1%} from what was told"
+
+
+def _probable(parts: Shared) -> str:
+    return f"{math.expm1(parts.change):+.1%} is most probable"
 
 
 def _of_length(told: list[float], parts: Shared, how: str) -> FoundQuantity:

@@ -14,11 +14,8 @@ from torchdic.scalar import number
 # How `torchdic new` says of a prism where its parts come from.
 _PARTS = re.compile(r"(?P<setting>.*?)length (?P<length>.*); angle (?P<angle>.*); bias (?P<bias>.*)")
 
-# Angles that differ by less, in degrees, are the same; and what parts a told value's origin from what agrees with it.
-SAME, AGREES = 1e-6, ", "
-
-# A length that changed by less than this share of it, as by rounding, stayed.
-STAYED = 1e-4
+# Angles that differ by less, in degrees, are the same.
+SAME = 1e-6
 
 _PRISMS, _FOCUS = "acquisition.prisms", "acquisition.focus"
 
@@ -34,10 +31,10 @@ def provenance(
     declared = told.acquisition if orders is None else orders.chosen.acquisition
     made: dict[str, str] = {}
     turned = _by_orders(told.acquisition, orders)
-    for place, parts in enumerate(_of_prisms(declared, now.acquisition, by_name)):
+    for place, parts in enumerate(_of_prisms(declared, by_name)):
         key = f"{_PRISMS}[{place}]"
         before = turned[place]
-        if parts := before | {part: _behind(before.get(part, ""), words) for part, words in parts.items()}:
+        if parts := before | {part: _then_also(before.get(part), words) for part, words in parts.items()}:
             made[key] = _with_parts(comments.get(key, ""), parts)
     if orders is not None and "signs and orders" in by_name:
         made |= _of_orders(told, orders, comments)
@@ -73,25 +70,19 @@ def _by_orders(told: Acquisition, orders: Orders | None) -> list[dict[str, str]]
     return changed
 
 
-def _of_prisms(declared: Acquisition, now: Acquisition, found: Mapping[str, FoundQuantity]) -> Iterator[dict[str, str]]:
+def _of_prisms(declared: Acquisition, found: Mapping[str, FoundQuantity]) -> Iterator[dict[str, str]]:
     """Of each prism where its length, its angle and its bias come from, as far as they were found."""
     axes, sheared = axes_of(declared), 0
-    for axis, prism, calibrated in zip(axes, declared.prisms, now.prisms, strict=True):
+    for axis, prism in zip(axes, declared.prisms, strict=True):
         if prism is None:
             yield {}
             continue
         length, angle, bias = _polar(prism)
         parts = {}
         if (quantity := found.get("shear's length")) is not None:
-            value, sure = quantity.value[axis], quantity.uncertainty[axis]
-            parts["length"] = _calibrated(sure, length, " µm")
-            if calibrated is not None and abs(_polar(calibrated)[0] / length - 1) < STAYED:
-                parts["length"] = f"{AGREES}calibrated: {value:.4g} ± {sure:.2g} µm agrees"
+            parts["length"] = _calibrated(quantity.uncertainty[axis], length, " µm")
         if (quantity := found.get("shear's angle")) is not None:
             parts["angle"] = _calibrated(math.degrees(quantity.uncertainty[axis]), angle % 360, "°")
-            if calibrated == prism and quantity.value[axis] != quantity.before[axis]:
-                sure = f"± {math.degrees(quantity.uncertainty[axis]):.2g}°"
-                parts["angle"] = f"{AGREES}calibrated: {math.degrees(quantity.value[axis]) % 360:.4g}° {sure} agrees"
         if (quantity := found.get("bias")) is not None:
             parts["bias"] = _calibrated(math.degrees(quantity.uncertainty[sheared]), bias, "°")
         elif (quantity := found.get("compensator's zero")) is not None:
@@ -111,19 +102,18 @@ def _calibrated(sure: float, told: float, unit: str) -> str:
     return f"calibrated: ± {sure:.2g}{unit}, told {told:.4g}{unit}"
 
 
+def _then_also(before: str | None, words: str) -> str:
+    return words if before is None else f"{before}, then {words}"
+
+
 def _with_parts(comment: str, parts: Mapping[str, str]) -> str:
     """A prism's comment, in which some parts are replaced; where it says none, they stand behind it."""
     known = _PARTS.fullmatch(comment)
     if known is None:
-        words = "; ".join(f"{part} {words.removeprefix(AGREES)}" for part, words in parts.items())
+        words = "; ".join(f"{part} {words}" for part, words in parts.items())
         return f"{comment}; {words}" if comment else words
     said = {part: parts.get(part, known[part]) for part in ("length", "angle", "bias")}
-    return known["setting"] + "; ".join(f"{part} {_behind(known[part], words)}" for part, words in said.items())
-
-
-def _behind(origin: str, words: str) -> str:
-    """New words about a part: behind where its value comes from if they agree with that, else in its place."""
-    return origin + words if words.startswith(AGREES) else words
+    return known["setting"] + "; ".join(f"{part} {words}" for part, words in said.items())
 
 
 def _of_orders(told: Config, orders: Orders, comments: Mapping[str, str]) -> dict[str, str]:

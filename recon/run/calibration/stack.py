@@ -12,6 +12,7 @@ from recon.calibration.trials.orders import Orders, find_orders
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
 from recon.fit.bounds import Bounds
+from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Problem, Recipe
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.cut_field import needed_margin
@@ -86,7 +87,10 @@ class CalibrationStack:
     def beside(self, planes: int = PLANES) -> Beside:
         """The part of the stack beside a volume that is fitted to it; the volume goes on where the specimen is cut."""
         config, part = self.config, self.part(planes=planes)
-        recipe = Recipe(bounds=config.reconstruction.bounds, prior=config.reconstruction.prior)
+        told = config.reconstruction
+        # what flattening around a specimen has left of the lamp would be put down to the optics
+        learn = (Lamp.name,) if Lamp.name in told.learn else ()
+        recipe = Recipe(bounds=told.bounds, prior=told.prior, learn=learn)
         scene = part.grid, self.microscope, config.volume.background
         margin = needed_margin(part.data.cpu().numpy(), self.noise, *scene)
         setup = part.setup(config.volume.background, self.microscope, config.acquisition, margin)

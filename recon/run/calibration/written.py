@@ -1,13 +1,16 @@
 """What a calibration leaves in its folder."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from recon.calibration.foreknowledge import Foreknowledge
 from recon.config.rewritten import Source, rewritten, rewritten_microscope
 from recon.config.schema import CalibrationSection, Config
-from recon.run.calibration.found import Calibration
+from recon.run.calibration.corrected import corrected
+from recon.run.calibration.found import DIRECTION, LENGTH, Calibration, FoundQuantity, rounded
 from recon.run.calibration.provenance import provenance
 from torchdic import __version__
 from torchdic.files.whole import write_json, write_text
@@ -35,7 +38,7 @@ def write_calibration(
     """
     orders, found = calibration.orders, calibration.found
     config = replace(calibration.config, calibration=CalibrationSection())
-    source = source.without("calibration")
+    source = source.without("calibration").with_comments(corrected(source.comments, told.assumed))
     comments = provenance(told, config, orders, found, source.comments)
     head = [f"Written by torchdic calibrate ({__version__}), which found:"]
     head += [f"  {quantity.words}" for quantity in found]
@@ -54,6 +57,17 @@ def write_calibration(
     written = [CALIBRATED, CALIBRATION]
     if with_microscope:
         use = f'include = "{MICROSCOPE}" at the top of another stack\'s configuration uses these.'
-        write_text(out / MICROSCOPE, rewritten_microscope(config, source, comments, [*head, use]))
+        reused = replace(config, calibration=_known_by_bead(found))
+        write_text(out / MICROSCOPE, rewritten_microscope(reused, source, comments, [*head, use]))
         written.append(MICROSCOPE)
     print(f"{out / written[0]}, {', '.join(written[1:])}")
+
+
+def _known_by_bead(found: Sequence[FoundQuantity]) -> CalibrationSection:
+    """How closely a bead tells the prisms: what other stacks' calibrations weigh their images against."""
+    unsure = {quantity.name: quantity for quantity in found if quantity.told}
+    length = unsure[LENGTH]
+    share = max(deviation / value for deviation, value in zip(length.uncertainty, length.value, strict=True))
+    within = Foreknowledge(share, *(max(unsure[name].uncertainty) for name in ("bias", DIRECTION))).limits
+    angles = (math.radians(rounded(math.degrees(min(angle, math.pi / 2)), 2)) for angle in within[1:])
+    return CalibrationSection(None, (), False, rounded(min(within[0], 0.99), 2), *angles)
