@@ -82,10 +82,11 @@ def test_an_empty_volume_stays_empty():
 
 
 def test_the_deviation_by_noise_is_that_of_the_refits():
+    """About the one without noise: that priors draw a noisy one's volume in is what noise does, too."""
     drawn = torch.randn(200, 4, 6, 6, generator=torch.Generator().manual_seed(0))
-    found = noise_deviation(list(0.01 * drawn))
-    assert float(found.mean()) == pytest.approx(0.01, rel=0.02)
-    few = [noise_deviation(list(part)) for part in drawn.split(10)]
+    assert float(noise_deviation(0.01 * drawn).mean()) == pytest.approx(0.01, rel=0.02)
+    assert float(noise_deviation(0.01 * drawn + 0.02).mean()) == pytest.approx(math.hypot(0.01, 0.02), rel=0.02)
+    few = [noise_deviation(part) for part in drawn.split(10)]
     single = [part.std(0) for part in drawn.split(10)]
     assert float(torch.stack(few).std()) < 0.7 * float(torch.stack(single).std())
 
@@ -96,13 +97,14 @@ def test_the_interval_of_noise_holds_68_percent_of_what_it_does():
     normal = torch.randn(17, 6, 12, 12, generator=random)
     seldom = normal * (torch.rand(normal.shape, generator=random) < 0.3)  # most voxels stay where they are
     for kind, volumes in (("normal", normal), ("seldom", seldom)):
-        *known, unseen = volumes
+        known, unseen = volumes[:-1], volumes[-1]
         interval = noise_interval(known, everywhere)
-        off, bar = (unseen - torch.stack(known).mean(0)).abs(), noise_deviation(known)
-        assert float((off <= interval * bar).float().mean()) == pytest.approx(0.68, abs=0.05)
+        assert float((unseen.abs() <= interval * noise_deviation(known)).float().mean()) == pytest.approx(
+            0.68, abs=0.05
+        )
         assert interval == pytest.approx(1.0, abs=0.1) if kind == "normal" else interval < 0.6
-    assert noise_interval(list(normal[:2]), everywhere) == 1.0  # two don't tell
-    assert noise_interval([torch.zeros(6, 12, 12)] * 4, everywhere) == 1.0
+    assert noise_interval(normal[:1], everywhere) == 1.0  # one doesn't tell
+    assert noise_interval(torch.zeros(4, 6, 12, 12), everywhere) == 1.0
 
 
 def blurred(volume, width):
@@ -174,7 +176,8 @@ def test_errors_of_numbers_are_those_of_the_refits():
     outline = torch.ones(GRID.shape, dtype=torch.bool)
     delta = torch.full(GRID.shape, 0.02)
     region = Region.within("all", outline, delta)
-    noisy = [Refit("noise", i, delta * factor) for i, factor in enumerate((0.99, 1.0, 1.01))]
+    noisy = [Refit("noise", i, delta * factor) for i, factor in enumerate((0.97, 0.99))]
+    noisy.append(Refit("noiseless", 0, 0.98 * delta))
     lost = [Refit("turned", i, delta * factor, delta) for i, factor in enumerate((0.9, 0.94))]
     found = known_measures(region, delta, GRID, 0.185, [*noisy, *lost], {0: outline, 1: outline})["mass"]
     assert found.usual == pytest.approx(-0.08, rel=1e-4)
@@ -191,7 +194,7 @@ def test_an_edge_that_is_not_known_is_an_error_of_the_number():
     delta = blurred(ball(), (0.8, 1.0, 1.0))
     region = Region.within("all", outline, delta)
     faded = Refit("turned", 0, 0.8 * delta, delta)
-    found = known_measures(region, delta, GRID, 0.185, [faded], {0: outline})["volume"]
+    found = known_measures(region, delta, GRID, 0.185, [Refit("noiseless", 0, delta), faded], {0: outline})["volume"]
     assert found.usual == pytest.approx(0.0, abs=0.02)
     kept = region.measures(0.8 * delta, GRID, 0.185)["volume"] / found.found - 1
     assert found.whole == pytest.approx(-kept * found.found, rel=0.02)
@@ -224,7 +227,8 @@ def test_the_bars_of_a_linear_estimator_are_what_its_noise_leaves():
     problem = problem_of(images())
     estimate = Estimate(problem, averaging(problem), lambda images: torch.tensor(0.02), GaussianMisfit, averaging)
     found = list(refits(estimate, planned_refits(40, 0)))
-    deviation = noise_deviation([refit.delta for refit in found])
+    assert [refit.kind for refit in found] == ["noiseless", *(40 * ["noise"])]
+    deviation = noise_deviation(torch.stack([refit.delta for refit in found[1:]]) - found[0].delta)
     assert float(deviation.mean()) == pytest.approx(0.02 / 10 / math.sqrt(2), rel=0.03)
 
 
@@ -258,7 +262,8 @@ def test_other_images_are_fitted_as_the_first_were_in_the_end():
     delta = ball()
     estimate = Estimate(problem, step_of(delta, 33.0), lambda images: torch.tensor(0.02), GaussianMisfit, solve)
     list(refits(estimate, planned_refits(1, 1)))
-    noisy, copied = seen
+    noiseless, noisy, copied = seen
+    assert noiseless.unknowns[0].given is None
     for fitted in seen:
         assert fitted.weight.first == 33.0
         assert fitted.weight.next([{"tv": 33.0}], 0.5, None, 1.0, 1.0)[0] == 33.0
@@ -358,7 +363,7 @@ def test_it_leaves_volumes_a_figure_and_numbers(done):
     assert specimen["dry_mass_pg"]["error"] > 0
     assert 0 < told["seen_share"] < 1
     assert (done / "error_bars.png").stat().st_size > 0
-    assert len(list((done / "refits").glob("*.npy"))) == 5
+    assert len(list((done / "refits").glob("*.npy"))) == 6
 
 
 @pytest.mark.filterwarnings("always::recon.report.verdict.PoorFitWarning")
@@ -415,7 +420,7 @@ def test_a_folder_without_a_reconstruction_is_refused(tmp_path, capsys):
 def test_refits_of_another_volume_are_replaced_only_on_request(done, folder, capsys):
     (done / "refits" / "identity.txt").write_text("another")
     assert "holds the refits of another volume; replace them with --restart" in refused(folder, capsys)
-    assert len(list((done / "refits").glob("*.npy"))) == 5
+    assert len(list((done / "refits").glob("*.npy"))) == 6
     assert bars(folder, "--restart") == 0
     assert "another" not in (done / "refits" / "identity.txt").read_text()
 
@@ -424,7 +429,7 @@ def test_files_of_unknown_origin_are_not_thrown_away(done, folder, capsys):
     told = (done / "refits" / "identity.txt").read_text()
     (done / "refits" / "identity.txt").unlink()
     assert "replace them with --restart" in refused(folder, capsys)
-    assert len(list((done / "refits").glob("*.npy"))) == 5
+    assert len(list((done / "refits").glob("*.npy"))) == 6
     (done / "refits" / "identity.txt").write_text(told)
 
 
@@ -439,7 +444,7 @@ def test_an_interruption_keeps_the_refits_so_far(done, folder, capsys, monkeypat
     with monkeypatch.context() as patched:
         patched.setattr("recon.run.evidence.error_bars.solved", stop)
         assert bars(folder) == 130
-    assert "2 of 5 refits are left to do" in capsys.readouterr().err
+    assert "2 of 6 refits are left to do" in capsys.readouterr().err
     assert bars(folder) == 0
     assert (done / "refits" / "noise_00.npy").read_bytes() == before
 

@@ -56,12 +56,14 @@ def bars_of(
 ) -> ErrorBars:
     """The error bars that refits of an estimate tell.
 
-    increment: of the index with concentration, ml/g. outlines: drawn around parts of the field's volume, by name.
+    refits: of all kinds, one of them without noise. increment: of the index with concentration, ml/g.
+    outlines: drawn around parts of the field's volume, by name.
     """
     setup = estimate.problem.setup
     grid, delta = setup.field, setup.within_field(estimate.delta).cpu()
-    by_noise = [refit.delta for refit in refits if refit.kind == "noise"]
-    deviation, interval = noise_deviation(by_noise), noise_interval(by_noise, near(delta))
+    (noiseless,) = (refit.delta for refit in refits if refit.kind == "noiseless")
+    off = torch.stack([refit.delta - noiseless for refit in refits if refit.kind == "noise"])
+    deviation, interval = noise_deviation(off), noise_interval(off, near(delta))
     copies = [refit for refit in refits if refit.kind == "turned"]
     model = ErrorModel.of_copies(copies, grid, 1 / cutoff(setup))
     total = deviation if model is None else torch.maximum(model.deviation(delta), deviation)

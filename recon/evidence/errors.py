@@ -1,8 +1,9 @@
 """Error bars of each voxel: of what the noise does, and of the whole error.
 
-Noise: the standard deviation of the refits to other noise. Of so few refits it is itself uncertain, by 1/√(2n), so each
-voxel's variance is averaged with the mean of its six neighbours'. Noise moves few voxels far, those of faint edges, and
-most hardly at all. So how many deviations hold 68 % of what it does is told by each refit beside the others.
+Noise: the root mean square of how far the refits to other noise lie from the one without noise. Priors draw noisy
+images' volume in more than noiseless ones', and that is in it. Of so few refits it is itself uncertain, by 1/√(2n), so
+each voxel's square is averaged with the mean of its six neighbours'. Noise moves few voxels far, those of faint edges,
+and most hardly at all. So how many deviations hold 68 % of what it does is told by each refit beside the others.
 
 The whole error: where the images say little, an estimate errs by how Δn changes from a voxel to its neighbours: it
 blurs, rounds and draws out. So the squared error is taken as a sum of the estimate's local variances in windows of
@@ -11,7 +12,6 @@ copies, of which the truth is known. A common factor then makes the bars hold 68
 conformal prediction: G. Shafer and V. Vovk, J. Mach. Learn. Res. 9, 371, 2008).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,30 +48,26 @@ def near(delta: Float[Tensor, "z y x"]) -> Bool[Tensor, "z y x"]:
     return torch.from_numpy(binary_dilation(inside.numpy(), iterations=AROUND))
 
 
-def noise_deviation(volumes: Sequence[Float[Tensor, "z y x"]]) -> Float[Tensor, "z y x"]:
-    """Standard deviation of each voxel over volumes that differ by noise alone, averaged with its neighbours'."""
-    variance = torch.stack(list(volumes)).var(0)
-    pooled = convolve(variance.numpy(), NEIGHBOURS.astype(variance.numpy().dtype), mode="nearest")
+def noise_deviation(off: Float[Tensor, "refit z y x"]) -> Float[Tensor, "z y x"]:
+    """Standard deviation of each voxel by noise. off: how far each refit with noise lies from that without."""
+    squares = off.square().mean(0).numpy()
+    pooled = convolve(squares, NEIGHBOURS.astype(squares.dtype), mode="nearest")
     return torch.from_numpy(pooled).clamp_min(0).sqrt()
 
 
-def noise_interval(volumes: Sequence[Float[Tensor, "z y x"]], where: Bool[Tensor, "z y x"]) -> float:
+def noise_interval(off: Float[Tensor, "refit z y x"], where: Bool[Tensor, "z y x"]) -> float:
     """How many standard deviations of voxels hold 68 % of what noise does: 1 if it were normal.
 
-    volumes: they differ by noise alone, and each is compared with the others. where: voxels that count. 1 too where
-    nothing has moved, and of fewer than three volumes, which don't tell.
+    off: as in `noise_deviation`; each refit is compared with the others. where: voxels that count. 1 too where nothing
+    has moved, and of fewer than two refits, which don't tell.
     """
-    number = len(volumes)
-    if number < 3:
+    if len(off) < 2:
         return 1.0
     ratios = []
-    for place, volume in enumerate(volumes):
-        others = [*volumes[:place], *volumes[place + 1 :]]
-        off = (volume - torch.stack(others).mean(0)).abs()
-        # the mean of the others is uncertain, too
-        expected = noise_deviation(others) * math.sqrt(1 + 1 / (number - 1))
-        moved = where & ((off > 0) | (expected > 0))
-        ratios.append((off / expected.clamp_min(torch.finfo(off.dtype).tiny))[moved])
+    for place, moved_by in enumerate(off):
+        expected = noise_deviation(torch.cat([off[:place], off[place + 1 :]]))
+        moved = where & ((moved_by != 0) | (expected > 0))
+        ratios.append((moved_by.abs() / expected.clamp_min(torch.finfo(off.dtype).tiny))[moved])
     together = torch.cat(ratios).numpy()
     return float(np.quantile(together, HELD)) if together.size else 1.0
 

@@ -23,7 +23,7 @@ INCREMENT = 0.185
 
 QUANTITIES = ("volume", "mean", "mass")
 
-# A number in refits to other noise, and by which parts of itself it is off in copies.
+# How far a number is off in refits with noise from that without, and by which parts of itself it is off in copies.
 Scatter = tuple[list[float], list[float]]
 
 # Values that differ by less than this part of the largest are alike.
@@ -116,7 +116,8 @@ def known_measures(
 
     In each refit its threshold is found anew, as it was in the estimate; and it is kept, for which the error may be
     larger, because where the part begins isn't known either. The larger one counts.
-    delta: the estimate. refits: of both kinds. outlines: the region's outline in each turned copy, by its number.
+    delta: the estimate. refits: of all kinds, one of them without noise.
+    outlines: the region's outline in each turned copy, by its number.
     """
 
     def anew(volume: Tensor, outline: Tensor) -> dict[str, float]:
@@ -137,14 +138,18 @@ def _scattered(
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
 ) -> dict[str, Scatter]:
     """How each of a region's numbers scatters. measures: all of them in a volume, within an outline."""
-    noisy = [measures(refit.delta, region.outline) for refit in refits if refit.truth is None]
+    (noiseless,) = (measures(refit.delta, region.outline) for refit in refits if refit.kind == "noiseless")
+    noisy = [measures(refit.delta, region.outline) for refit in refits if refit.kind == "noise"]
     pairs = [
         (measures(refit.truth, outlines[refit.number]), measures(refit.delta, outlines[refit.number]))
         for refit in refits
         if refit.truth is not None
     ]
     return {
-        name: ([one[name] for one in noisy], [found[name] / true[name] - 1 for true, found in pairs if true[name] != 0])
+        name: (
+            [one[name] - noiseless[name] for one in noisy],
+            [found[name] / true[name] - 1 for true, found in pairs if true[name] != 0],
+        )
         for name in QUANTITIES
     }
 
@@ -152,9 +157,12 @@ def _scattered(
 def _known(found: float, anew: Scatter, kept: Scatter) -> Known:
     """A number that was found. anew, kept: how it scatters with a threshold that is found anew, or kept."""
     usual = max(float(np.mean(anew[1])), -MOST_LOST) if anew[1] else 0.0
-    noise = max(float(np.std(noisy, ddof=1)) if len(noisy) > 1 else 0.0 for noisy, _ in (anew, kept))
-    whole = max(math.sqrt(float(np.mean(np.square(off)))) if off else 0.0 for _, off in (anew, kept))
+    noise, whole = (max(_root_mean_square(scatter[part]) for scatter in (anew, kept)) for part in (0, 1))
     return Known(found, usual, noise / (1 + usual), abs(found) * whole / (1 + usual))
+
+
+def _root_mean_square(values: Sequence[float]) -> float:
+    return math.sqrt(float(np.mean(np.square(values)))) if values else 0.0
 
 
 def as_json(regions: Mapping[str, tuple[Region, Mapping[str, Known]]], background: float) -> dict[str, Any]:
