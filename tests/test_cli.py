@@ -1,3 +1,4 @@
+import argparse
 import os
 import re
 import subprocess
@@ -12,6 +13,8 @@ import tomli_w
 
 import torchdic
 from recon.cli import main
+from recon.cli.arguments import repeated
+from recon.cli.commands import COMMANDS
 from recon.cli.specimens import SPECIMENS
 from recon.config.reading import load
 from recon.run.data import load_data
@@ -487,15 +490,77 @@ def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, mor
     assert "condenser NA 1.4" in dark[0]
 
 
-def test_ctrl_c_while_torch_is_loaded_ends_in_one_line(monkeypatch, capsys):
+def test_ctrl_c_while_torch_is_loaded_ends_in_one_line(monkeypatch, capsys, tmp_path):
     class Stops:
         """Stands for an import that is interrupted."""
 
         def find_spec(self, name, path=None, target=None):
-            if name == "recon.cli.commands":
+            if name == "recon.cli.running":
                 raise KeyboardInterrupt
 
-    monkeypatch.delitem(sys.modules, "recon.cli.commands", raising=False)
+    monkeypatch.delitem(sys.modules, "recon.cli.running", raising=False)
     monkeypatch.setattr(sys, "meta_path", [Stops(), *sys.meta_path])
-    assert main(["demo", "--out", "somewhere"]) == 130
+    assert main(["demo", "--out", str(tmp_path / "somewhere")]) == 130
     assert capsys.readouterr().err == "torchdic: error: interrupted\n"
+
+
+@pytest.mark.parametrize("words", [["--help"], ["reconstruct", "--help"], ["nonsense"]])
+def test_help_does_not_wait_for_torch(words):
+    """It would take seconds; so would a mistyped command."""
+    code = f"""
+import sys
+from recon.cli import main
+try:
+    main({words!r})
+except SystemExit:
+    pass
+print(*sorted({{"torch", "numpy", "scipy"}} & set(sys.modules)), file=sys.stderr)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stderr.splitlines()[-1] == ""
+    assert ("torchdic" in said.stdout) == ("--help" in words)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_commands_help_shows_an_example_that_it_can_read(command, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([command, "--help"])
+    assert stopped.value.code == 0
+    example = COMMANDS[command].example
+    assert f"example: torchdic {example}" in " ".join(capsys.readouterr().out.split())
+    parser = argparse.ArgumentParser()
+    COMMANDS[command].add_arguments(parser)
+    assert example.split()[0] == command
+    parser.parse_args(repeated(example.split()[1:], COMMANDS[command].several))
+
+
+@pytest.mark.parametrize(
+    ("words", "out"),
+    [
+        (["reconstruct", "runs/cell.toml"], "runs/cell_volume"),
+        (["calibrate", "cell.v2.toml"], "cell.v2_calibration"),
+        (["simulate", "cell.toml"], "cell_simulated"),
+        (["coverage", "cell.toml"], "cell_coverage"),
+        (["work-precision", "cell.toml"], "cell_work_precision"),
+        (["phase", "runs/image.ome.tif"], "runs/image_phase"),
+        (["phase", "planes"], "planes_phase"),
+        (["demo"], "demo"),
+        (["reconstruct", "cell.toml", "--out", "here"], "here"),
+    ],
+)
+def test_results_go_beside_the_input_where_no_folder_is_named(words, out, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr("recon.cli.running.run", lambda _, options: seen.append(options.out) or 0)
+    assert main(words) == 0
+    assert seen == [Path(out)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_usual_folder_that_is_a_file_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cell_volume").write_text("precious")
+    with pytest.raises(SystemExit) as stopped:
+        main(["reconstruct", "cell.toml"])
+    assert stopped.value.code == 2
+    assert "cell_volume: can't be written to" in capsys.readouterr().err

@@ -155,9 +155,9 @@ def test_finer_truth_is_the_mean_of_finer_voxels():
 def test_a_specimens_stack_is_not_that_of_the_model_that_fits_it(config, monkeypatch, tmp_path):
     """Its images come from the exact field and carry the camera's noise: what is left is not 0 but the noise."""
     seen = []
-    monkeypatch.setattr("recon.cli.fits.fit_trials", lambda recorded, *_: seen.append(recorded) or iter(()))
-    monkeypatch.setattr("recon.cli.fits.fits_table", lambda _: "")
-    monkeypatch.setattr("recon.cli.fits.draw_fits", lambda _: None)
+    monkeypatch.setattr("recon.cli.accuracy.fits.fit_trials", lambda recorded, *_: seen.append(recorded) or iter(()))
+    monkeypatch.setattr("recon.cli.accuracy.fits.fits_table", lambda _: "")
+    monkeypatch.setattr("recon.cli.accuracy.fits.draw_fits", lambda _: None)
     path = config(BEAD)
     assert work_precision(path, tmp_path / "out") == 2  # no candidate was tried
     (recorded,) = seen
@@ -300,7 +300,7 @@ def test_a_run_leaves_table_json_and_figure(config, tmp_path, capsys, monkeypatc
     def made(*_):
         raise AssertionError("a stack was made before the folder was looked at")
 
-    monkeypatch.setattr("recon.cli.fits._recorded", made)
+    monkeypatch.setattr("recon.cli.accuracy.fits._recorded", made)
     assert work_precision(config(BEAD, FEW, QUICK), tmp_path / "out") == 2
     assert "--restart" in capsys.readouterr().err
 
@@ -317,7 +317,7 @@ def test_an_interruption_loses_no_fit(measured, tmp_path, capsys, monkeypatch):
             yield trial
 
     with monkeypatch.context() as patch:
-        patch.setattr("recon.cli.fits.fit_trials", interrupted)
+        patch.setattr("recon.cli.accuracy.fits.fit_trials", interrupted)
         assert work_precision(path, out) == 130
     assert "interrupted after 2 of 4 fits; go on with --resume" in capsys.readouterr().err
     first = kept(out)

@@ -47,8 +47,7 @@ def typed(command, tmp_path, out):
 def test_every_command_with_a_folder_is_looked_at_here():
     parsers = {name: argparse.ArgumentParser() for name in COMMANDS}
     for name, parser in parsers.items():
-        for add in COMMANDS[name].arguments:
-            add(parser)
+        COMMANDS[name].add_arguments(parser)
     dirs = {n for n, p in parsers.items() if any(a.dest == "out" and a.metavar == "DIR" for a in p._actions)}
     assert dirs == set(LEAVES) | RESUMED | REPEATED
 

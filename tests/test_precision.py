@@ -15,7 +15,7 @@ import torch
 
 from data_synthetic import Bead, GaussianBall
 from recon.cli import main
-from recon.cli import work_precision as work_precision_command
+from recon.cli.accuracy import work_precision as work_precision_command
 from recon.config.conversion import converter, dump
 from recon.config.reading import load
 from recon.report.fronts import MARKS, as_dict, draw_fronts, marks_of, write_csv

@@ -1,15 +1,13 @@
-"""The arguments that commands share: each function here adds one to a command's parser."""
+"""The arguments that commands share: each function here adds one to a command's parser.
+
+What takes seconds to import is imported where it is needed, so that help is there at once.
+"""
 
 import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-
-import torch
-
-from recon.config.schema import ConfigError
-from recon.run.folder.prepared import check_folder
-from torchdic import __version__
+from typing import Any, NoReturn
 
 # A word that is meant as a number.
 _NUMBER = re.compile(r"[+-]?[\d.,]+(e[+-]?\d+)?")
@@ -25,15 +23,34 @@ def config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def out(parser: argparse.ArgumentParser) -> None:
-    """The folder for the results."""
-    parser.add_argument(
-        "--out",
-        type=_folder,
-        required=True,
-        metavar="DIR",
-        help="folder for the results; it is made where it is missing",
-    )
+def out(parser: argparse.ArgumentParser, what: str = "") -> None:
+    """The folder for the results.
+
+    what: the results are. Without --out they go beside the input, into a folder that is named after it and them; or,
+    where there is no input, after the command.
+    """
+    usual = f"beside the input, named after it: NAME_{what}" if what else parser.prog.rpartition(" ")[2]
+    parser.set_defaults(what=what, usual_out=usual)
+    parser.add_argument("--out", type=_folder, metavar="DIR", help=f"folder for the results (default: {usual})")
+
+
+def choose_out(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Put in the usual folder where the user has named none; an error of the parser's where it can't be written to."""
+    if getattr(options, "usual_out", None) is None or options.out is not None:
+        return
+    name = options.usual_out
+    if options.what:
+        given: Path = options.config if "config" in options else options.image[0]
+        name = given.with_name(f"{stem(given)}_{options.what}")
+    try:
+        options.out = _folder(str(name))
+    except argparse.ArgumentTypeError as error:
+        parser.error(str(error))
+
+
+def stem(path: Path) -> str:
+    """A file's name without its suffixes; a folder's name."""
+    return re.sub(r"(\.ome)?\.[A-Za-z0-9]{1,5}$", "", path.name) or path.name
 
 
 def out_if_wanted(parser: argparse.ArgumentParser) -> None:
@@ -105,11 +122,24 @@ def repeated(words: Sequence[str], several: Sequence[str]) -> list[str]:
 
 def version(parser: argparse.ArgumentParser) -> None:
     """The version of torchdic."""
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}", help="print the version")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+
+
+class _Version(argparse.Action):
+    """Prints the version and ends the program."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> NoReturn:
+        from torchdic import __version__
+
+        print(f"{parser.prog} {__version__}")
+        parser.exit()
 
 
 def _folder(name: str) -> Path:
     """A folder that can be written to, as far as can be seen before it is made: first of all, not after the work."""
+    from recon.config.schema import ConfigError
+    from recon.run.folder.prepared import check_folder
+
     try:
         check_folder(Path(name))
     except ConfigError as error:
@@ -117,7 +147,10 @@ def _folder(name: str) -> Path:
     return Path(name)
 
 
-def _device(name: str) -> torch.device:
+def _device(name: str) -> Any:
+    """A device of torch."""
+    import torch
+
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -1,101 +1,122 @@
-"""The commands, a row each, and what happens to their errors and warnings."""
+"""The commands, a row each, and what the user has typed of them.
+
+Nothing here imports torch, which takes seconds: help is there at once, and a command's module is imported with it.
+"""
 
 import argparse
 import sys
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from functools import partial
+from importlib import import_module
+from typing import NoReturn
 
-from tqdm import tqdm
-
-from recon.cli import arguments, calibrate, demo, plan, reconstruct, simulate, work_precision
-from recon.cli.evidence import coverage, error_bars
-from recon.cli.own_stack import new, phase
-from recon.cli.own_stack.options import SEVERAL
-from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
+from recon.cli import arguments
 from recon.report.terminal import write_plainly
-from recon.run.checkpoint import CheckpointError
-from recon.run.folder.lock import FolderInUseError, folders_released, hold
-from recon.run.folder.results import FinishedError
-from recon.run.interruption import InterruptedRunError
-from recon.run.results import ResultsError
-from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
-from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
-from torchdic.files.whole import WriteError
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-
-# What the user can put right, in one line that says what.
-WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
+BAD_INPUT, INTERRUPTED = 2, 130
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command: its help in one line, the function that runs it, the arguments that it takes, and its other names.
+    """A command.
 
-    several: its options that take several numbers.
+    module: has its function `run`. help: in one line. example: how it is typed, without `torchdic`. shared: arguments
+    that other commands have too. own: whether its module has further `arguments`, which stand before the shared ones.
+    aliases: its other names.
     """
 
+    module: str
     help: str
-    run: Callable[[argparse.Namespace], None]
-    arguments: tuple[Callable[[argparse.ArgumentParser], None], ...]
+    example: str
+    shared: tuple[Callable[[argparse.ArgumentParser], None], ...]
+    own: bool = False
     aliases: tuple[str, ...] = ()
-    several: tuple[str, ...] = ()
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add all of its arguments to its parser."""
+        if self.own:
+            import_module(self.module).arguments(parser)
+        for add in self.shared:
+            add(parser)
+
+    @property
+    def several(self) -> tuple[str, ...]:
+        """Its options that take several numbers."""
+        return getattr(import_module(self.module), "SEVERAL", ()) if self.own else ()
 
 
 COMMANDS = {
     "demo": Command(
+        "recon.cli.demo",
         "simulate a small bead, reconstruct it in three ways and compare each with the truth",
-        demo.run,
+        "demo",
         (arguments.out, arguments.restart),
     ),
     "simulate": Command(
+        "recon.cli.simulate",
         "simulate the DIC images of a known specimen",
-        simulate.run,
-        (arguments.config, arguments.out, arguments.device, arguments.restart),
+        "simulate cell.toml --out cell_simulated",
+        (arguments.config, partial(arguments.out, what="simulated"), arguments.device, arguments.restart),
     ),
     "new": Command(
+        "recon.cli.own_stack.new",
         "write a configuration for a recorded stack, from its file and its images",
-        new.run,
-        (new.arguments,),
-        ("init",),
-        several=SEVERAL,
+        "new cell.ome.tif --condenser-na 0.7 --bias 85 --out run.toml",
+        (),
+        own=True,
+        aliases=("init",),
     ),
     "phase": Command(
+        "recon.cli.own_stack.phase",
         "find the phase, on an arbitrary scale, behind one image whose optics are unknown",
-        phase.run,
-        (phase.arguments, arguments.out, arguments.restart),
+        "phase image.tif --out image_phase",
+        (partial(arguments.out, what="phase"), arguments.restart),
+        own=True,
     ),
     "plan": Command(
+        "recon.cli.accuracy.plan",
         "find the fastest way to compute images within a tolerance, and which effects matter",
-        plan.run,
+        "plan run.toml",
         (arguments.config, arguments.out_if_wanted, arguments.device),
     ),
     "coverage": Command(
+        "recon.cli.evidence.coverage",
         "tell which frequencies of the index an acquisition sees, before it is recorded, and what would add to them",
-        coverage.run,
-        (arguments.config, arguments.out, coverage.arguments, arguments.restart),
+        "coverage run.toml --suggest",
+        (arguments.config, partial(arguments.out, what="coverage"), arguments.restart),
+        own=True,
     ),
     "calibrate": Command(
+        "recon.cli.calibrate",
         "find signs, orders and values of the optics, as far as the images of a stack tell them",
-        calibrate.run,
-        (arguments.config, arguments.out, arguments.device, arguments.restart),
+        "calibrate run.toml --out run_calibration",
+        (arguments.config, partial(arguments.out, what="calibration"), arguments.device, arguments.restart),
     ),
     "reconstruct": Command(
+        "recon.cli.reconstruct",
         "find the refractive-index volume behind a stack of DIC images",
-        reconstruct.run,
-        (arguments.config, arguments.out, arguments.device, arguments.earlier_run),
+        "reconstruct run.toml --out run_volume",
+        (arguments.config, partial(arguments.out, what="volume"), arguments.device, arguments.earlier_run),
     ),
     "error-bars": Command(
+        "recon.cli.evidence.error_bars",
         "tell how far each voxel of a reconstruction, and the numbers of its parts, can be trusted",
-        error_bars.run,
-        (error_bars.arguments, arguments.device, arguments.restart),
+        "error-bars run_volume --regions labels.tif",
+        (arguments.device, arguments.restart),
+        own=True,
     ),
     "work-precision": Command(
+        "recon.cli.accuracy.work_precision",
         "measure what accuracy costs: the error of images, or of reconstructions, against seconds and memory",
-        work_precision.run,
-        (arguments.config, arguments.out, arguments.device, arguments.fit, arguments.earlier_run),
+        "work-precision cell.toml --fit",
+        (
+            arguments.config,
+            partial(arguments.out, what="work_precision"),
+            arguments.device,
+            arguments.fit,
+            arguments.earlier_run,
+        ),
     ),
 }
 
@@ -108,32 +129,18 @@ def main(typed: Sequence[str] | None = None) -> int:
     """
     write_plainly()
     words = list(sys.argv[1:] if typed is None else typed)
-    rows = [row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)]
-    several = rows[0].several if rows else ()
-    options = _parser().parse_args(arguments.repeated(words, several))
-    _show_each_warning_once()
+    chosen = next((row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), None)
+    parser = _parser(chosen)
     try:
-        with folders_released():
-            _hold_folder(options)
-            options.run(options)
-    except WRONG as error:
-        return _fail(str(error), BAD_INPUT)
-    except TurnedRaysError as error:
-        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
-    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
-        return _fail(f"{options.config}: {error}", BAD_INPUT)
-    except FloatingPointError as error:
-        return _fail(str(error), FAILED)
-    except (InterruptedRunError, KeyboardInterrupt) as error:
-        return _fail(str(error) or "interrupted", INTERRUPTED)
-    return 0
-
-
-def _hold_folder(options: argparse.Namespace) -> None:
-    """Keep other runs out of the command's folder, where it is there already."""
-    out = getattr(options, "out", None)
-    if out is not None and out.is_dir():
-        hold(out)
+        options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
+        if chosen is None:
+            parser.error("a command is wanted; torchdic --help lists them")
+        arguments.choose_out(options, parser)
+        from recon.cli.running import run
+    except KeyboardInterrupt:
+        print("torchdic: error: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return run(chosen.module, options)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -143,7 +150,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(chosen: Command | None) -> argparse.ArgumentParser:
+    """The parser of all commands, with the arguments of the one that was chosen."""
     parser = _Parser(
         prog="torchdic",
         description="Simulate DIC images, and reconstruct the refractive-index volume behind measured ones.",
@@ -152,33 +160,13 @@ def _parser() -> argparse.ArgumentParser:
     arguments.version(parser)
     found = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
-        words = f"{command.help[0].upper()}{command.help[1:]}."
-        below = found.add_parser(name, help=command.help, description=words, aliases=list(command.aliases))
-        below.set_defaults(run=command.run)
-        for add in command.arguments:
-            add(below)
+        below = found.add_parser(
+            name,
+            help=command.help,
+            description=f"{command.help[0].upper()}{command.help[1:]}.",
+            epilog=f"example: torchdic {command.example}",
+            aliases=list(command.aliases),
+        )
+        if command is chosen:
+            command.add_arguments(below)
     return parser
-
-
-def _show_each_warning_once() -> None:
-    """Show each warning once, as one line above the progress bar; of each kind about images, the first.
-
-    Python's own rule "once" would show a warning again for each module that it comes from. A descent's images change
-    from step to step, and with them the digits of a warning about them.
-    """
-    shown: set[object] = set()
-
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        kind = type(message) if isinstance(message, BatchWarning) else str(message)
-        if kind not in shown:
-            shown.add(kind)
-            tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
-
-    warnings.showwarning = show
-    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning, UnlikelyWarning):
-        warnings.simplefilter("always", kind)
-
-
-def _fail(message: str, code: int) -> int:
-    print(f"torchdic: error: {message}", file=sys.stderr)
-    return code

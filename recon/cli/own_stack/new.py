@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from recon.cli.own_stack.options import Given, add_options, given_of, in_radians
+from recon.cli.arguments import stem
+from recon.cli.own_stack.options import SEVERAL, Given, add_options, given_of, in_radians
 from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
 from recon.cli.own_stack.table import summary, warnings_of
@@ -19,6 +20,8 @@ from torchdic.files.gathered import Gathered, gather
 from torchdic.files.stack import write_stack
 from torchdic.files.whole import write_text
 
+__all__ = ["SEVERAL", "arguments", "run"]
+
 # A pixel in µm, of which no spot of light fills one alone.
 SMALL = 0.05
 
@@ -28,7 +31,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "stack", type=Path, nargs="+", metavar="STACK", help="a file, several (a plane or a setting each), or a folder"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN.toml", help="configuration file to write")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="RUN.toml",
+        help="configuration file to write (default: beside the stack, named after it)",
+    )
     parser.add_argument("--series", type=int, metavar="N", help="which of several stacks in the file, counted from 0")
     add_options(parser)
     parser.add_argument("--lower", action="store_true", help="the specimen's index is below its medium's")
@@ -36,28 +44,29 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write a configuration for a stack and print what is in it, and what is assumed."""
-    check_out(options.out, options.stack)
+    out = options.out or options.stack[0].with_name(f"{stem(options.stack[0])}.toml")
+    check_out(out, options.stack)
     given = given_of(options)
     gathered = gather(options.stack, options.series)
     found, settled = look(gathered, {**given, "lower": options.lower})
-    joined = None if gathered.one_file else joined_beside(options.out)
+    joined = None if gathered.one_file else joined_beside(out)
     if joined is not None:
         check_not_there([joined])
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
-    path = seen_from(options.out.parent, data if joined is None else joined)
+    path = seen_from(out.parent, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
-    config = parse(text.encode(), str(options.out))  # what the user gave may break a law
-    options.out.parent.mkdir(parents=True, exist_ok=True)
+    config = parse(text.encode(), str(out))  # what the user gave may break a law
+    out.parent.mkdir(parents=True, exist_ok=True)
     if joined is not None:
         _join(gathered, settled, joined)
-    write_text(options.out, text)
-    print(summary(options.out, gathered, found, settled))
+    write_text(out, text)
+    print(summary(out, gathered, found, settled))
     likely_wrong = [*in_radians(given), *(f"warning: {line}" for line in unlikely(config))]
     for line in (*warnings_of(gathered, found, settled), *likely_wrong):
         print(f"  {line}")
     print(
-        f"\nCorrect what is assumed in {options.out}. Then torchdic calibrate {options.out} --out DIR finds what the "
-        f"images can tell, and torchdic reconstruct {options.out} --out DIR the volume."
+        f"\nCorrect what is assumed in {out}. Then torchdic calibrate {out} finds what the images can tell, and "
+        f"torchdic reconstruct {out} the volume."
     )
 
 

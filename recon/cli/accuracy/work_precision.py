@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from recon.cli import fits
+from recon.cli.accuracy import fits
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
 from recon.config.resolved import leave_resolved

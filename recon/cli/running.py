@@ -1,0 +1,75 @@
+"""A command that the user has chosen is run here: what happens to its errors and warnings."""
+
+import argparse
+import sys
+import warnings
+from importlib import import_module
+from typing import Any
+
+from tqdm import tqdm
+
+from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
+from recon.run.checkpoint import CheckpointError
+from recon.run.folder.lock import FolderInUseError, folders_released, hold
+from recon.run.folder.results import FinishedError
+from recon.run.interruption import InterruptedRunError
+from recon.run.results import ResultsError
+from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
+from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
+from torchdic.files.whole import WriteError
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+# What the user can put right, in one line that says what.
+WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
+
+
+def run(module: str, options: argparse.Namespace) -> int:
+    """Run the command of a module with the user's options; returns the exit code, see `recon.cli.commands.main`."""
+    _show_each_warning_once()
+    try:
+        with folders_released():
+            _hold_folder(options)
+            import_module(module).run(options)
+    except WRONG as error:
+        return _fail(str(error), BAD_INPUT)
+    except TurnedRaysError as error:
+        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
+    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
+        return _fail(f"{options.config}: {error}", BAD_INPUT)
+    except FloatingPointError as error:
+        return _fail(str(error), FAILED)
+    except (InterruptedRunError, KeyboardInterrupt) as error:
+        return _fail(str(error) or "interrupted", INTERRUPTED)
+    return 0
+
+
+def _hold_folder(options: argparse.Namespace) -> None:
+    """Keep other runs out of the command's folder, where it is there already."""
+    out = getattr(options, "out", None)
+    if out is not None and out.is_dir():
+        hold(out)
+
+
+def _show_each_warning_once() -> None:
+    """Show each warning once, as one line above the progress bar; of each kind about images, the first.
+
+    Python's own rule "once" would show a warning again for each module that it comes from. A descent's images change
+    from step to step, and with them the digits of a warning about them.
+    """
+    shown: set[object] = set()
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        kind = type(message) if isinstance(message, BatchWarning) else str(message)
+        if kind not in shown:
+            shown.add(kind)
+            tqdm.write(f"torchdic: warning: {message}", file=sys.stderr)
+
+    warnings.showwarning = show
+    for kind in (ApertureWarning, AssumedWarning, SamplingWarning, ToleranceWarning, UnlikelyWarning):
+        warnings.simplefilter("always", kind)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"torchdic: error: {message}", file=sys.stderr)
+    return code
