@@ -10,4 +10,5 @@ RESULTS = {
     "sections.png",
     "misfit.png",
     "checkpoint.pt",
+    "README.txt",
 }

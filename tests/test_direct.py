@@ -29,7 +29,8 @@ CONFIG = {
     "fidelity": {"sources": 6, "order": 1},
     "data": {"path": "stack.ome.tif"},
 }
-RESULTS = {"volume.ome.tif", "metrics.json", "config.resolved.toml", "images.ome.tif", "images.png", "sections.png"}
+RESULTS = {"volume.ome.tif", "images.ome.tif", "images.png", "sections.png"}
+RESULTS |= {"metrics.json", "config.resolved.toml", "README.txt"}
 METHODS = pytest.mark.parametrize("method", ["linear", "opl"])
 OPL_SLOW = pytest.mark.parametrize("method", ["linear", pytest.param("opl", marks=pytest.mark.slow)])
 

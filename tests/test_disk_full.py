@@ -95,7 +95,7 @@ def test_a_checkpoint_without_room_is_told_and_the_run_goes_on(run, full):
 
 
 @pytest.mark.parametrize(
-    "name", sorted(RESULTS - {"log.csv", "images.png", "sections.png", "misfit.png", "checkpoint.pt"})
+    "name", sorted(RESULTS - {"log.csv", "images.png", "sections.png", "misfit.png", "checkpoint.pt", "README.txt"})
 )
 def test_a_result_without_room_is_named_and_the_others_are_kept(run, full, name):
     full(name)
@@ -103,7 +103,15 @@ def test_a_result_without_room_is_named_and_the_others_are_kept(run, full, name)
     assert code == 2
     assert told[-1].startswith("torchdic: error: ")
     assert f"{name}: cannot be written: No space left on device; make room and go on with --resume" in told[-1]
-    assert left == RESULTS - {name} | {"checkpoint.pt"}
+    assert left == RESULTS - {name, "README.txt"} | {"checkpoint.pt"}
+
+
+def test_an_index_without_room_is_told_and_loses_nothing(run, full):
+    full("README.txt")
+    code, told, left = run("reconstruct")
+    assert code == 0
+    assert "README.txt: cannot be written: No space left on device" in told[-1]
+    assert left == RESULTS - {"README.txt"}
 
 
 def test_a_run_whose_results_had_no_room_goes_on_to_write_them(run, monkeypatch, full, tmp_path):

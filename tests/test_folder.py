@@ -9,6 +9,7 @@ import pytest
 from recon.cli import main
 from recon.cli.commands import COMMANDS
 from recon.config.schema import ConfigError
+from recon.run.folder.index import FILES
 from recon.run.folder.lock import folders_released, hold
 from recon.run.folder.prepared import check_folder, prepare_folder
 from recon.run.folder.results import FinishedError, check_no_results
@@ -50,6 +51,7 @@ def test_every_command_with_a_folder_is_looked_at_here():
         COMMANDS[name].add_arguments(parser)
     dirs = {n for n, p in parsers.items() if any(a.dest == "out" and a.metavar == "DIR" for a in p._actions)}
     assert dirs == set(LEAVES) | RESUMED | REPEATED
+    assert {name for names in LEAVES.values() for name in names} <= set(FILES)
 
 
 @pytest.mark.parametrize("command", [*LEAVES, *RESUMED, *REPEATED])

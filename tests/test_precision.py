@@ -447,7 +447,7 @@ def test_command_leaves_csv_json_and_a_figure(run, tmp_path):
     code, _ = run(CONFIG)
     assert code == 0
     out = tmp_path / "out"
-    left = [*(f"work_precision.{kind}" for kind in ("csv", "json", "png")), "config.resolved.toml"]
+    left = [*(f"work_precision.{kind}" for kind in ("csv", "json", "png")), "config.resolved.toml", "README.txt"]
     assert {path.name for path in out.iterdir()} == set(left)
     found = json.loads((out / "work_precision.json").read_text(encoding="utf-8"))
     straight, best = (converter.structure(trial, Trial) for trial in found["trials"])

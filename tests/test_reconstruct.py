@@ -118,7 +118,7 @@ def other(workplace, tmp_path):
 
 
 def test_simulate_leaves_a_stack_and_its_picture(workplace):
-    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png", "config.resolved.toml"}
+    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png", "config.resolved.toml", "README.txt"}
     assert pictures.imread(workplace / "simulated" / "stack.png").std() > 0
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from tqdm import tqdm
 
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
-from recon.run.checkpoint import CheckpointError
+from recon.run.checkpoint import CheckpointError, UnsavedWarning
+from recon.run.folder.index import leave_index
 from recon.run.folder.lock import FolderInUseError, folders_released, hold
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
@@ -31,6 +32,7 @@ def run(module: str, options: argparse.Namespace) -> int:
         with folders_released():
             _hold_folder(options)
             import_module(module).run(options)
+            _leave_index(options)
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
@@ -49,6 +51,17 @@ def _hold_folder(options: argparse.Namespace) -> None:
     out = getattr(options, "out", None)
     if out is not None and out.is_dir():
         hold(out)
+
+
+def _leave_index(options: argparse.Namespace) -> None:
+    """Say in the folder of the results what each file is."""
+    out = getattr(options, "out", None) or getattr(options, "folder", None)
+    if out is None or not out.is_dir():
+        return
+    try:
+        leave_index(out)
+    except WriteError as error:  # the results are there
+        warnings.warn(str(error), UnsavedWarning, stacklevel=2)
 
 
 def _show_each_warning_once() -> None:

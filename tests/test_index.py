@@ -1,0 +1,69 @@
+"""README.txt of a folder of results says of each file what it is."""
+
+import pytest
+
+from recon.cli import main
+from recon.run.folder.index import FILES, INDEX, leave_index
+from recon.run.folder.lock import LOCK
+
+CONFIG = """
+[volume]
+shape = [5, 26, 24]
+spacing = [0.6, 0.25, 0.25]
+background = 1.4
+[microscope]
+wavelength = 0.55
+objective = { na = 0.8 }
+condenser = { na = 0.5 }
+camera = { photons = 5000.0 }
+[acquisition]
+focus = { first = -1.0, step = 1.0, count = 3 }
+prisms = [
+    { shear = { length = 0.25, angle_degrees = 30 }, bias_degrees = 80 },
+    { shear = { length = 0.25, angle_degrees = 30 }, bias_degrees = -80 },
+]
+[specimen]
+kind = "bead"
+radius = 1.0
+contrast = 0.03
+[data]
+path = "made/stack.ome.tif"
+[reconstruction]
+bounds = { lower = 0.0 }
+steps = 3
+[fidelity]
+propagation = "wave"
+sources = 8
+"""
+
+COMMANDS = (
+    ("made", "simulate", "bead.toml"),
+    ("seen", "coverage", "bead.toml", "--suggest"),
+    ("volume", "reconstruct", "bead.toml"),
+    ("image", "phase", "made/stack.ome.tif"),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_each_file_of_a_folder_is_explained(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "bead.toml").write_text(CONFIG)
+    for out, *words in COMMANDS:
+        assert main([*words, "--out", out]) == 0
+    assert main(["error-bars", "volume", "--refits", "2", "--copies", "2"]) == 0
+    for out, *_ in COMMANDS:
+        there = {path.name for path in (folder / out).iterdir()} - {INDEX, LOCK}
+        assert there <= set(FILES)
+        lines = (folder / out / INDEX).read_text(encoding="utf-8").splitlines()[2:]
+        assert [line.split()[0] for line in lines] == [name for name in FILES if name in there]
+
+
+def test_a_folder_without_results_has_no_index(tmp_path):
+    (tmp_path / "mine.txt").write_text("precious")
+    leave_index(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
