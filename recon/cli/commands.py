@@ -53,6 +53,12 @@ COMMANDS = {
         "demo",
         (arguments.out, arguments.restart),
     ),
+    "doctor": Command(
+        "recon.cli.doctor.command",
+        "tell what this installation holds, and test in seconds whether it computes what it should",
+        "doctor --device cpu",
+        (arguments.device,),
+    ),
     "simulate": Command(
         "recon.cli.simulate",
         "simulate the DIC images of a known specimen",
@@ -125,7 +131,8 @@ def main(typed: Sequence[str] | None = None) -> int:
     """Run a command.
 
     typed: the words after `torchdic`; None takes them from the command line.
-    Returns the exit code: 0, 1 for a fit that diverges, 2 for bad input, 130 for an interruption.
+    Returns the exit code: 0, 1 for a fit that diverges or an installation that errs, 2 for bad input, 130 for an
+    interruption.
     """
     write_plainly()
     words = list(sys.argv[1:] if typed is None else typed)

@@ -8,6 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from recon.cli.doctor.command import SelfTestError
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.run.checkpoint import CheckpointError, UnsavedWarning
 from recon.run.folder.index import leave_index
@@ -39,7 +40,7 @@ def run(module: str, options: argparse.Namespace) -> int:
         return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
     except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
         return _fail(f"{options.config}: {error}", BAD_INPUT)
-    except FloatingPointError as error:
+    except (FloatingPointError, SelfTestError) as error:
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
