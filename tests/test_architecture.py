@@ -35,6 +35,7 @@ ROOMS = (
     "planning",
     "files",
     "tiff",
+    "__main__",
 )
 # recon's, likewise; data_synthetic stands beside them, and only the command line sees it.
 RECON = (
@@ -51,6 +52,7 @@ RECON = (
     "report",
     "run",
     "cli",
+    "__main__",
 )
 CONTRACT = {
     "Acquisition",

@@ -564,3 +564,12 @@ def test_a_usual_folder_that_is_a_file_is_refused(tmp_path, monkeypatch, capsys)
         main(["reconstruct", "cell.toml"])
     assert stopped.value.code == 2
     assert "cell_volume: can't be written to" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("package", ["torchdic", "recon"])
+def test_a_package_is_run_as_the_command(package):
+    said = subprocess.run([sys.executable, "-m", package, "--version"], capture_output=True, text=True, check=True)
+    assert said.stdout == f"torchdic {torchdic.__version__}\n"
+    wrong = subprocess.run([sys.executable, "-m", package, "nonsense"], capture_output=True, text=True, check=False)
+    assert wrong.returncode == 2
+    assert len(wrong.stderr.splitlines()) == 1

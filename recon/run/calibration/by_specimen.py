@@ -99,12 +99,11 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
         return stack, left(name, unit, told, why + _hidden(found, beside))
     known = _known(config).angle
-    values = [most_probable(least.value, each, known) for least, each in zip(found, deviations, strict=True)]
-    turns, sure = zip(*values, strict=True)
+    weighed = (most_probable(least.value, each, known) for least, each in zip(found, deviations, strict=True))
+    turns, sure = zip(*weighed, strict=True)
     by_images = ", ".join(map(_off, found, deviations))
     how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; the images put it {by_images} "
-    how += f"from what was told, which is known to {math.degrees(config.calibration.angle_within):.2g}°; "
-    how += "from right towards down"
+    how += f"from what was told, which is known to {math.degrees(config.calibration.angle_within):.2g}°"
     unknown = ShearOfAxes(axes_of(config.acquisition))
     turned = torch.tensor([[1.0, turn] for turn in turns], dtype=torch.float64)
     made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
