@@ -19,7 +19,7 @@ from recon.config import load
 from recon.config.commented import comments_of
 from recon.config.spelling import direction
 from recon.run.calibration import by_specimen
-from recon.run.calibration.corrected import corrected
+from recon.run.calibration.assumed import corrected, foreknowledge
 from recon.run.calibration.found import FoundQuantity, left
 from recon.run.calibration.provenance import provenance
 from recon.run.calibration.stack import CalibrationStack
@@ -299,6 +299,16 @@ def test_what_the_user_has_corrected_is_no_longer_said_to_be_assumed():
     assert corrected({"acquisition.focus": step}, ["order of the planes"]) == {
         "acquisition.focus": "step told; assumed: the first plane is first; measured: the sharpest is 2"
     }
+
+
+def test_what_is_assumed_is_hardly_known_beforehand(tmp_path):
+    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
+    config = load(tmp_path / "run.toml")
+    length, bias, angle = foreknowledge(config).limits  # of these the angle was measured
+    assert (length, math.degrees(bias), math.degrees(angle)) == pytest.approx((0.5, 40, 10))
+    told = replace(config, assumed=(), calibration=replace(config.calibration, bias_within=math.radians(3)))
+    length, bias, angle = foreknowledge(told).limits
+    assert (length, math.degrees(bias), math.degrees(angle)) == pytest.approx((0.15, 3, 10))
 
 
 def orders(what, acquisition, mistakes):

@@ -6,12 +6,13 @@ from dataclasses import replace
 import torch
 
 from recon.calibration.beside_volume import Beside, find_angles, find_aperture, find_images, find_length
-from recon.calibration.foreknowledge import Foreknowledge, most_probable
+from recon.calibration.foreknowledge import most_probable
 from recon.calibration.length_and_bias import Shared, shared
 from recon.calibration.optics import ShearOfAxes, axes_of, firsts_of
 from recon.calibration.trials.profile import Least
 from recon.calibration.trials.short_fits import can_be_tried
 from recon.config.schema import Config
+from recon.run.calibration.assumed import foreknowledge
 from recon.run.calibration.found import (
     DIRECTION,
     LENGTH,
@@ -98,12 +99,12 @@ def _angles(stack: CalibrationStack, beside: Beside) -> tuple[CalibrationStack, 
     if max(deviations) > UNSURE_ANGLE:
         why = "volumes explain the images as well with other directions: the specimen's own structure hides it"
         return stack, left(name, unit, told, why + _hidden(found, beside))
-    known = _known(config).angle
-    weighed = (most_probable(least.value, each, known) for least, each in zip(found, deviations, strict=True))
+    known = foreknowledge(config)
+    weighed = (most_probable(least.value, each, known.angle) for least, each in zip(found, deviations, strict=True))
     turns, sure = zip(*weighed, strict=True)
     by_images = ", ".join(map(_off, found, deviations))
     how = f"volumes fitted with {_tried(found)} directions, {_misfits(found, beside)}; the images put it {by_images} "
-    how += f"from what was told, which is known to {math.degrees(config.calibration.angle_within):.2g}°"
+    how += f"from what was told, which is known to {math.degrees(known.limits[2]):.2g}°"
     unknown = ShearOfAxes(axes_of(config.acquisition))
     turned = torch.tensor([[1.0, turn] for turn in turns], dtype=torch.float64)
     made = unknown.put(turned, replace(beside.setup, acquisition=config.acquisition)).acquisition
@@ -161,22 +162,17 @@ def _length(stack: CalibrationStack, *, alone: bool) -> tuple[CalibrationStack, 
         why = "volumes explain the images as well with other lengths; use a bead"
         return stack, [left(LENGTH, "µm", told, why + _hidden([found], beside))]
     biases = [number(prism.bias) for prism in config.acquisition.prisms if prism is not None]
-    known = _known(config)
+    known = foreknowledge(config)
     parts = shared(found.value, deviation, biases, replace(known, bias=0.0) if alone else known)
     how = f"volumes fitted with {_tried([found])} lengths, {_misfits([found], beside)}; {_weighed(found, deviation)}; "
-    how += f"with the length known to {config.calibration.length_within:.2g} of it"
+    how += f"with the length known to {known.limits[0]:.2g} of it"
     if alone:
         return _with_prisms(stack, parts), [_of_length(told, parts, f"{how} {_probable(parts)}")]
     parts = replace(parts, biases=tuple(map(rounded_angle, parts.biases)))
-    how += f" and the bias to {math.degrees(config.calibration.bias_within):.2g}° {_probable(parts)}"
+    how += f" and the bias to {math.degrees(known.limits[1]):.2g}° {_probable(parts)}"
     values, unsure = ([rounded(v, n) for v in part] for part, n in ((parts.biases, 5), (parts.bias_deviations, 2)))
     bias = FoundQuantity("bias", "rad", biases, values, unsure, f"{PRODUCT}; see its length")
     return _with_prisms(stack, parts), [_of_length(told, parts, how), bias]
-
-
-def _known(config: Config) -> Foreknowledge:
-    known = config.calibration
-    return Foreknowledge.within(known.length_within, known.bias_within, known.angle_within)
 
 
 def _weighed(found: Least, deviation: float) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from recon.calibration.foreknowledge import Foreknowledge
 from recon.config.rewritten import Source, rewritten, rewritten_microscope
 from recon.config.schema import CalibrationSection, Config
-from recon.run.calibration.corrected import corrected
+from recon.run.calibration.assumed import corrected
 from recon.run.calibration.found import DIRECTION, LENGTH, Calibration, FoundQuantity, rounded
 from recon.run.calibration.provenance import provenance
 from torchdic import __version__

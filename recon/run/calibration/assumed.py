@@ -1,7 +1,14 @@
-"""Comments that say of a value that it is assumed, where the user has corrected it and no longer lists it so."""
+"""What a configuration lists as assumed: it is hardly known, and once it has been corrected, it is told."""
 
+import math
 import re
 from collections.abc import Collection, Iterator, Mapping
+
+from recon.calibration.foreknowledge import Foreknowledge
+from recon.config.schema import Config
+
+# Within what `torchdic new` guesses right: a length as a share of it, a bias and a direction in rad.
+GUESSED = (0.5, math.radians(40), math.radians(45))
 
 # What `torchdic new` lists as assumed, by the key whose comment says so.
 _OF_KEYS = {
@@ -19,6 +26,19 @@ _OF_PARTS = {"length": "shear's length", "angle": "shear's angle", "bias": "bias
 
 # An origin reaches to the next part, or to the end of the comment.
 _PART = re.compile(rf"\b(?P<part>{'|'.join(_OF_PARTS)}) assumed.*?(?=; (?:{'|'.join(_OF_PARTS)}|assumed|measured)\b|$)")
+
+
+def foreknowledge(config: Config) -> Foreknowledge:
+    """How closely the prisms are known beforehand: as the configuration says, or what it lists as assumed, hardly."""
+    told = config.calibration
+    said = (told.length_within, told.bias_within, told.angle_within)
+    names = ("shear's length", "bias", "shear's angle")
+    return Foreknowledge.within(
+        *(
+            max(each, guess) if name in config.assumed else each
+            for each, guess, name in zip(said, GUESSED, names, strict=True)
+        )
+    )
 
 
 def corrected(comments: Mapping[str, str], assumed: Collection[str]) -> dict[str, str]:
