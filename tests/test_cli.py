@@ -544,17 +544,24 @@ def test_each_commands_help_shows_an_example_that_it_can_read(command, capsys):
         (["work-precision", "cell.toml"], "cell_work_precision"),
         (["phase", "runs/image.ome.tif"], "runs/image_phase"),
         (["phase", "planes"], "planes_phase"),
+        (["phase", "run.2"], "run.2_phase"),
+        (["phase", "cell_40x_1.4"], "cell_40x_1.4_phase"),
+        (["phase", "BIG.OME.TIFF"], "BIG_phase"),
+        (["phase", "run.2/.."], None),
+        (["phase", "."], None),
         (["demo"], "demo"),
         (["reconstruct", "cell.toml", "--out", "here"], "here"),
     ],
 )
 def test_results_go_beside_the_input_where_no_folder_is_named(words, out, tmp_path, monkeypatch):
+    (tmp_path / "run.2").mkdir()
     monkeypatch.chdir(tmp_path)
+    out = tmp_path.with_name(f"{tmp_path.name}_phase") if out is None else out
     seen = []
     monkeypatch.setattr("recon.cli.running.run", lambda _, options: seen.append(options.out) or 0)
     assert main(words) == 0
     assert seen == [Path(out)]
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["run.2"]
 
 
 def test_a_usual_folder_that_is_a_file_is_refused(tmp_path, monkeypatch, capsys):
@@ -563,7 +570,33 @@ def test_a_usual_folder_that_is_a_file_is_refused(tmp_path, monkeypatch, capsys)
     with pytest.raises(SystemExit) as stopped:
         main(["reconstruct", "cell.toml"])
     assert stopped.value.code == 2
-    assert "cell_volume: can't be written to" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "cell_volume: can't be written to" in said
+    assert said.strip().endswith("name another folder by --out")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "a command is wanted; torchdic --help lists them"),
+        (["reconstuct", "x.toml"], "reconstuct: no such command; did you mean reconstruct?"),
+        (["xyz"], "xyz: no such command; there are demo, doctor, simulate"),
+        (["--device", "cpu", "reconstruct", "x.toml"], "--device: options come after the command"),
+    ],
+)
+def test_what_is_no_command_is_told_in_one_line(words, said, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2
+    err = capsys.readouterr().err
+    assert err.startswith(f"torchdic: error: {said}")
+    assert len(err.splitlines()) == 1
+
+
+def test_a_number_below_0_with_an_exponent_is_no_option():
+    assert repeated(["--offset", "-1e9", "s.tif"], ()) == ["--offset=-1e9", "s.tif"]
+    assert repeated(["--bias", "-6e1", "65", "s.tif"], ("--bias",)) == ["--bias=-6e1", "--bias", "65", "s.tif"]
+    assert repeated(["--offset", "-5", "s.tif"], ()) == ["--offset", "-5", "s.tif"]
 
 
 @pytest.mark.parametrize("package", ["torchdic", "recon"])

@@ -77,8 +77,8 @@ def test_how_closely_angles_are_known_may_be_given_in_degrees(write):
 @pytest.mark.parametrize(
     ("section", "law"),
     [
-        ("bias_within = 10", "bias_within 10 rad must be within 0 and π/2; bias_within_degrees is in °"),
-        ("angle_within_degrees = 100", "angle_within 1.74533 rad must be within 0 and π/2"),
+        ("bias_within = 10", "bias_within 10 rad, 572.958°, must be within 0 and 90°; bias_within_degrees is in °"),
+        ("angle_within_degrees = 100", "angle_within 1.74533 rad, 100°, must be within 0 and 90°"),
         ("length_within = 15", "length_within 15 must be a share from 0 to below 1; 0.1 is 10 %"),
         ("bias_within = 0.1\nbias_within_degrees = 6", "calibration.bias_within and calibration.bias_within_degrees"),
         ("bias_within_degree = 6", "unknown key calibration.bias_within_degree; did you mean 'bias_within_degrees'?"),

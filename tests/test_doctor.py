@@ -26,7 +26,7 @@ def test_a_sound_installation_is_told_so(capsys):
     assert re.search(rf"^torch +{re.escape(torch.__version__)} \(asked for: >=2.6\)$", out, re.MULTILINE)
     assert "this folder   can be written to" in out
     assert out.count("passed") == 3
-    assert out.strip().endswith("all is well")
+    assert out.strip().endswith("on cpu")
 
 
 def test_another_image_or_gradient_fails(capsys, monkeypatch, tmp_path):
@@ -40,6 +40,22 @@ def test_another_image_or_gradient_fails(capsys, monkeypatch, tmp_path):
         "torchdic: error: this installation computes something else than it should: "
         "images against stored ones (1.0e-04, at most 2.0e-05)"
     )
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "missing", "of another shape", "not finite"])
+def test_damaged_images_are_told_in_one_line(capsys, monkeypatch, tmp_path, damage):
+    path, stored = tmp_path / "stored.npy", np.load(selftest.STORED)
+    if damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "cut":
+        path.write_bytes(selftest.STORED.read_bytes()[:500])
+    elif damage != "missing":
+        np.save(path, stored[0] if damage == "of another shape" else np.where(stored > 0, np.nan, 0))
+    monkeypatch.setattr(selftest, "STORED", path)
+    code, _, err = told(capsys)
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "install torchdic again" in err
 
 
 def test_a_wrong_gradient_fails(monkeypatch):

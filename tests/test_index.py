@@ -1,5 +1,7 @@
 """README.txt of a folder of results says of each file what it is."""
 
+import os
+
 import pytest
 
 from recon.cli import main
@@ -61,6 +63,27 @@ def test_each_file_of_a_folder_is_explained(folder, monkeypatch):
         assert there <= set(FILES)
         lines = (folder / out / INDEX).read_text(encoding="utf-8").splitlines()[2:]
         assert [line.split()[0] for line in lines] == [name for name in FILES if name in there]
+
+
+def test_a_readme_of_the_users_stays(tmp_path):
+    (tmp_path / "stack.png").touch()
+    (tmp_path / INDEX).write_text("my notes")
+    leave_index(tmp_path)
+    assert (tmp_path / INDEX).read_text() == "my notes"
+    (tmp_path / INDEX).unlink()
+    leave_index(tmp_path)
+    (tmp_path / "coverage.json").touch()
+    leave_index(tmp_path)  # its own is renewed
+    assert "coverage.json" in (tmp_path / INDEX).read_text()
+
+
+def test_error_bars_of_an_earlier_volume_are_said_to_be(tmp_path):
+    for name, seconds in (("sd.ome.tif", 10), ("volume.ome.tif", 20), ("error_bars.json", 30)):
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (seconds, seconds))
+    leave_index(tmp_path)
+    lines = {line.split()[0]: line for line in (tmp_path / INDEX).read_text().splitlines()[2:]}
+    assert [name for name, line in lines.items() if line.endswith("(of an earlier volume)")] == ["sd.ome.tif"]
 
 
 def test_a_folder_without_results_has_no_index(tmp_path):

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from recon.cli.beside import beside
+
 # A word that is meant as a number.
-_NUMBER = re.compile(r"[+-]?[\d.,]+(e[+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?[\d.,]+(e[+-]?\d+)?", re.IGNORECASE)
+_BELOW_0 = re.compile(r"-(\d[\d.,]*e[+-]?\d+|inf|nan)", re.IGNORECASE)
 
 
 def config(parser: argparse.ArgumentParser) -> None:
@@ -41,16 +44,11 @@ def choose_out(options: argparse.Namespace, parser: argparse.ArgumentParser) -> 
     name = options.usual_out
     if options.what:
         given: Path = options.config if "config" in options else options.image[0]
-        name = given.with_name(f"{stem(given)}_{options.what}")
+        name = beside(given, f"_{options.what}")
     try:
         options.out = _folder(str(name))
     except argparse.ArgumentTypeError as error:
-        parser.error(str(error))
-
-
-def stem(path: Path) -> str:
-    """A file's name without its suffixes; a folder's name."""
-    return re.sub(r"(\.ome)?\.[A-Za-z0-9]{1,5}$", "", path.name) or path.name
+        parser.error(f"{error}; name another folder by --out")
 
 
 def out_if_wanted(parser: argparse.ArgumentParser) -> None:
@@ -107,7 +105,7 @@ def repeated(words: Sequence[str], several: Sequence[str]) -> list[str]:
     """
     told: list[str] = []
     option, numbers = "", 0
-    for word in words:
+    for word in _joined(words):
         name, _, value = word.partition("=")
         if name in several:
             option, numbers = name, int(bool(value))
@@ -118,6 +116,17 @@ def repeated(words: Sequence[str], several: Sequence[str]) -> list[str]:
             option = ""
         told.append(word)
     return told
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """The words, in which an option and a number such as -1e9 are one: argparse takes that for another option."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and _BELOW_0.fullmatch(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def version(parser: argparse.ArgumentParser) -> None:
@@ -157,5 +166,6 @@ def _device(name: str) -> Any:
         tensor = torch.zeros(1, device=name)
         tensor.item()  # fails on the device "meta", which holds no values
     except (RuntimeError, AssertionError) as error:
-        raise argparse.ArgumentTypeError(f"{name!r} is no device here: {str(error).splitlines()[0]}") from error
+        why = re.split(r"[.:,] ", str(error).splitlines()[0])[0]  # torch goes on to list all that it knows
+        raise argparse.ArgumentTypeError(f"{name!r} is no device here: {why}") from error
     return tensor.device

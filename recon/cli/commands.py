@@ -4,8 +4,13 @@ Nothing here imports torch, which takes seconds: help is there at once, and a co
 """
 
 import argparse
+import difflib
+import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -138,16 +143,55 @@ def main(typed: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if typed is None else typed)
     chosen = next((row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), None)
     parser = _parser(chosen)
+    if chosen is None and words:
+        _check_command(words[0], parser)
     try:
-        options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
-        if chosen is None:
-            parser.error("a command is wanted; torchdic --help lists them")
-        arguments.choose_out(options, parser)
-        from recon.cli.running import run
+        with interrupted_at_once():
+            options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
+            if chosen is None:
+                parser.error("a command is wanted; torchdic --help lists them")
+            arguments.choose_out(options, parser)
+            from recon.cli.running import run
+
+            import_module(chosen.module)
     except KeyboardInterrupt:
         print("torchdic: error: interrupted", file=sys.stderr)
         return INTERRUPTED
     return run(chosen.module, options)
+
+
+@contextmanager
+def interrupted_at_once() -> Iterator[None]:
+    """Within this block Ctrl-C ends the program in one line.
+
+    While packages are imported, KeyboardInterrupt may come out of them as any other error.
+    """
+
+    def stop(*_: object) -> NoReturn:
+        os.write(2, b"torchdic: error: interrupted\n")
+        os._exit(INTERRUPTED)
+
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # as behind nohup
+    if ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _check_command(word: str, parser: argparse.ArgumentParser) -> None:
+    """An error of the parser's where the first word is meant as a command, and isn't one."""
+    if word in ("-h", "--help", "--version"):
+        return
+    if word.startswith("-"):
+        parser.error(f"{word}: options come after the command, as in torchdic reconstruct run.toml --device cpu")
+    names = [name for key, row in COMMANDS.items() for name in (key, *row.aliases)]
+    close = difflib.get_close_matches(word, names, n=1)
+    meant = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+    parser.error(f"{word}: no such command; {meant}")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -165,7 +209,7 @@ def _parser(chosen: Command | None) -> argparse.ArgumentParser:
         epilog="torchdic COMMAND --help explains a command.",
     )
     arguments.version(parser)
-    found = parser.add_subparsers(required=True, metavar="COMMAND")
+    found = parser.add_subparsers(metavar="COMMAND")
     for name, command in COMMANDS.items():
         below = found.add_parser(
             name,

@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from recon.cli.doctor.command import SelfTestError
+from recon.cli.doctor.selftest import SelfTestError
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.run.checkpoint import CheckpointError, UnsavedWarning
 from recon.run.folder.index import leave_index
@@ -32,7 +32,11 @@ def run(module: str, options: argparse.Namespace) -> int:
     try:
         with folders_released():
             _hold_folder(options)
-            import_module(module).run(options)
+            try:
+                import_module(module).run(options)
+            except InterruptedRunError:
+                _leave_index(options)
+                raise
             _leave_index(options)
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)

@@ -235,7 +235,10 @@ class CalibrationSection:
             raise ValueError(f"length_within {self.length_within:g} must be a share from 0 to below 1; 0.1 is 10 %")
         for name in ("bias_within", "angle_within"):
             if not 0 <= (angle := getattr(self, name)) <= math.pi / 2:
-                raise ValueError(f"{name} {angle:g} rad must be within 0 and π/2; {name}_degrees is in °")
+                degrees = math.degrees(angle)
+                raise ValueError(
+                    f"{name} {angle:g} rad, {degrees:g}°, must be within 0 and 90°; {name}_degrees is in °"
+                )
         for term in self.aberrations:
             if term < 4:
                 raise ValueError(f"aberrations {term}: piston and tilts (Noll 1 to 3) don't show; 5 and above do")

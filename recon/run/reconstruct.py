@@ -107,8 +107,9 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
     have changed since, or its own misfit was one that only a script knows.
     """
     resolved = out / RESOLVED
-    if not (resolved.exists() and (out / VOLUME).exists()):
-        raise ConfigError(f"{out}: holds no finished reconstruction: {VOLUME} and {RESOLVED} are missing")
+    missing = [name for name in (VOLUME, RESOLVED) if not (out / name).exists()]
+    if missing:
+        raise ConfigError(f"{out}: holds no finished reconstruction: {' and '.join(missing)} missing")
     config, measured, misfit, problem, identity = _asked(load(resolved), device)
     if config.reconstruction.method in DIRECT:
         step, _ = solved_directly(config.reconstruction, problem, measured.noise)

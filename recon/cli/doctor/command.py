@@ -5,11 +5,7 @@ import time
 from pathlib import Path
 
 from recon.cli.doctor.installation import lines
-from recon.cli.doctor.selftest import outcomes
-
-
-class SelfTestError(RuntimeError):
-    """The self-test failed: this installation computes something else."""
+from recon.cli.doctor.selftest import SelfTestError, outcomes
 
 
 def run(options: argparse.Namespace) -> None:
@@ -22,4 +18,4 @@ def run(options: argparse.Namespace) -> None:
         failed += [] if outcome.passed else [f"{outcome.what} ({outcome.error:.1e}, at most {outcome.limit:.1e})"]
     if failed:
         raise SelfTestError(f"this installation computes something else than it should: {'; '.join(failed)}")
-    print(f"{'':14}in {time.perf_counter() - began:.1f} s on {options.device}: all is well")
+    print(f"{'':14}in {time.perf_counter() - began:.1f} s on {options.device}")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from recon.cli.arguments import stem
+from recon.cli.beside import beside
 from recon.cli.own_stack.options import SEVERAL, Given, add_options, given_of, in_radians
 from recon.cli.own_stack.paths import check_not_there, check_out, joined_beside
 from recon.cli.own_stack.settled import BACKGROUND, NA, WAVELENGTH, Settled, settle
@@ -13,6 +13,7 @@ from recon.cli.own_stack.unusable import check_background, check_recorded, put_b
 from recon.config.including import seen_from
 from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
+from recon.config.schema import ConfigError
 from recon.recording.stuck_pixels import sharpest
 from recon.recording.survey.survey import Survey, survey
 from torchdic import Microscope, Objective
@@ -44,8 +45,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write a configuration for a stack and print what is in it, and what is assumed."""
-    out = options.out or options.stack[0].with_name(f"{stem(options.stack[0])}.toml")
-    check_out(out, options.stack)
+    out = options.out or beside(options.stack[0], ".toml")
+    try:
+        check_out(out, options.stack)
+    except ConfigError as error:
+        raise error if options.out else ConfigError(f"{error}; name another file by --out") from error
     given = given_of(options)
     gathered = gather(options.stack, options.series)
     found, settled = look(gathered, {**given, "lower": options.lower})

@@ -47,10 +47,34 @@ FILES = {
 }
 
 
+# What is of the volume that was there when they were made.
+OF_VOLUME = ("sd.ome.tif", "error.ome.tif", "error_bars.png", "error_bars.json", "refits")
+
+_HEAD = "Left by torchdic"
+
+
 def leave_index(out: Path) -> None:
-    """Write README.txt into a folder of results. Raises WriteError."""
+    """Write README.txt into a folder of results, unless the user has one there. Raises WriteError."""
     there = [name for name in FILES if (out / name).exists()]
-    if there:
+    if there and _is_ours(out / INDEX):
         wide = max(map(len, there))
-        lines = [f"{name:{wide}}  {FILES[name]}" for name in there]
-        write_text(out / INDEX, "\n".join([f"Left by torchdic {__version__}:", "", *lines, ""]))
+        lines = [f"{name:{wide}}  {FILES[name]}{_age(out, name)}" for name in there]
+        write_text(out / INDEX, "\n".join([f"{_HEAD} {__version__}:", "", *lines, ""]))
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file may be replaced: it is missing, or was left here before."""
+    if not path.exists():
+        return True
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_HEAD)) == _HEAD.encode()
+    except OSError:  # a folder, or what can't be read
+        return False
+
+
+def _age(out: Path, name: str) -> str:
+    """What to say of error bars that are older than the volume beside them."""
+    volume = out / "volume.ome.tif"
+    older = name in OF_VOLUME and volume.exists() and (out / name).stat().st_mtime < volume.stat().st_mtime
+    return " (of an earlier volume)" if older else ""
