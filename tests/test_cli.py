@@ -597,6 +597,7 @@ def test_a_number_below_0_with_an_exponent_is_no_option():
     assert repeated(["--offset", "-1e9", "s.tif"], ()) == ["--offset=-1e9", "s.tif"]
     assert repeated(["--bias", "-6e1", "65", "s.tif"], ("--bias",)) == ["--bias=-6e1", "--bias", "65", "s.tif"]
     assert repeated(["--offset", "-5", "s.tif"], ()) == ["--offset", "-5", "s.tif"]
+    assert repeated(["--bias", "65", "−65"], ("--bias",)) == ["--bias", "65", "--bias", "-65"]  # copied from a text
 
 
 @pytest.mark.parametrize("package", ["torchdic", "recon"])

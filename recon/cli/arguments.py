@@ -119,9 +119,12 @@ def repeated(words: Sequence[str], several: Sequence[str]) -> list[str]:
 
 
 def _joined(words: Sequence[str]) -> list[str]:
-    """The words, in which an option and a number such as -1e9 are one: argparse takes that for another option."""
+    """The words, in which an option and a number such as -1e9 are one: argparse takes that for another option.
+
+    A minus sign that was copied from a text is a hyphen.
+    """
     joined: list[str] = []
-    for word in words:
+    for word in (f"-{word[1:]}" if re.match(r"−\d", word) else word for word in words):
         if joined and joined[-1].startswith("--") and "=" not in joined[-1] and _BELOW_0.fullmatch(word):
             joined[-1] += f"={word}"
         else:
