@@ -496,7 +496,9 @@ def test_a_killed_run_goes_on_and_ends_where_an_uninterrupted_one_does(long, tmp
     done = len(rows(out))
     assert 12 <= done < LONG
     kept = torch.load(out / "checkpoint.pt", weights_only=True)["step"]["number"]
-    early = {"log.csv", "checkpoint.pt"} | (set() if name == "SIGKILL" else {"volume.ome.tif"})  # the volume so far
+    early = {"log.csv", "checkpoint.pt"} | (
+        set() if name == "SIGKILL" else {"volume.ome.tif", "README.txt"}
+    )  # the volume so far
     assert RESULTS & set(content(out)) == early  # no other result is there before its time
     if name == "SIGKILL":
         assert code == -signal.SIGKILL
@@ -573,7 +575,7 @@ def eight(workplace):
         patch.setattr(figures, "save", lambda _, picture: picture.touch())
         interrupt_at(patch, 4)
         assert command("reconstruct", path, "--out", workplace / "stopped")[0] == 130
-        assert set(content(workplace / "stopped")) == {"log.csv", "checkpoint.pt", "volume.ome.tif"}
+        assert set(content(workplace / "stopped")) == {"log.csv", "checkpoint.pt", "volume.ome.tif", "README.txt"}
         assert command("reconstruct", path, "--out", workplace / "eight")[0] == 0
     return workplace / "stopped", workplace / "eight"
 
@@ -629,7 +631,7 @@ def test_an_interrupted_run_leaves_earlier_results_alone(other, interrupt, tmp_p
     assert "interrupted after step 2 of 5; go on with --resume; volume.interrupted.ome.tif holds Δn so far" in err
     after = content(out)
     assert after.keys() - before.keys() == {"volume.interrupted.ome.tif"}
-    assert {name for name in before if before[name] != after[name]} <= {"log.csv", "checkpoint.pt"}
+    assert {name for name in before if before[name] != after[name]} <= {"log.csv", "checkpoint.pt", "README.txt"}
     code, err = command("reconstruct", path, "--out", out)
     assert code == 2
     assert "an interrupted run; go on with --resume" in err

@@ -136,7 +136,8 @@ def test_the_microscope_alone_is_what_other_stacks_include(tmp_path, written):
     config, source = written
     (tmp_path / "scope.toml").write_text(rewritten_microscope(config, source, {}), encoding="utf-8")
     values = tomllib.loads((tmp_path / "scope.toml").read_text())
-    assert set(values) == {"microscope", "acquisition"}
+    assert set(values) == {"microscope", "acquisition", "calibration"}
+    assert set(values["calibration"]) == {"length_within", "bias_within_degrees", "angle_within_degrees"}
     assert set(values["acquisition"]) == {"prisms"}
     rest = TEXT[TEXT.index("[volume]") :]
     (tmp_path / "cell.toml").write_text(f'include = "scope.toml"\n{rest}', encoding="utf-8")
