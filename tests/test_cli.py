@@ -490,18 +490,22 @@ def test_a_reconstruction_above_the_index_says_so_once(write, run, tmp_path, mor
     assert "condenser NA 1.4" in dark[0]
 
 
-def test_ctrl_c_while_torch_is_loaded_ends_in_one_line(monkeypatch, capsys, tmp_path):
-    class Stops:
-        """Stands for an import that is interrupted."""
-
-        def find_spec(self, name, path=None, target=None):
-            if name == "recon.cli.running":
-                raise KeyboardInterrupt
-
-    monkeypatch.delitem(sys.modules, "recon.cli.running", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Stops(), *sys.meta_path])
-    assert main(["demo", "--out", str(tmp_path / "somewhere")]) == 130
-    assert capsys.readouterr().err == "torchdic: error: interrupted\n"
+@pytest.mark.parametrize("command", ["demo", "phase"])  # of the latter the arguments are imported, too
+def test_ctrl_c_while_torch_is_loaded_ends_in_one_line(command, tmp_path):
+    code = f"""
+import os, signal, sys
+from recon.cli import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Stops:
+    def find_spec(self, name, path=None, target=None):
+        if name == "torch":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Stops())
+sys.exit(main([{command!r}, "--out", {str(tmp_path / "somewhere")!r}]))
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 130
+    assert ended.stderr == "torchdic: error: interrupted\n"
 
 
 @pytest.mark.parametrize("words", [["--help"], ["reconstruct", "--help"], ["nonsense"]])

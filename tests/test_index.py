@@ -3,40 +3,11 @@
 import os
 
 import pytest
+from small_bead import CONFIG
 
 from recon.cli import main
 from recon.run.folder.index import FILES, INDEX, leave_index
 from recon.run.folder.lock import LOCK
-
-CONFIG = """
-[volume]
-shape = [5, 26, 24]
-spacing = [0.6, 0.25, 0.25]
-background = 1.4
-[microscope]
-wavelength = 0.55
-objective = { na = 0.8 }
-condenser = { na = 0.5 }
-camera = { photons = 5000.0 }
-[acquisition]
-focus = { first = -1.0, step = 1.0, count = 3 }
-prisms = [
-    { shear = { length = 0.25, angle_degrees = 30 }, bias_degrees = 80 },
-    { shear = { length = 0.25, angle_degrees = 30 }, bias_degrees = -80 },
-]
-[specimen]
-kind = "bead"
-radius = 1.0
-contrast = 0.03
-[data]
-path = "made/stack.ome.tif"
-[reconstruction]
-bounds = { lower = 0.0 }
-steps = 3
-[fidelity]
-propagation = "wave"
-sources = 8
-"""
 
 COMMANDS = (
     ("made", "simulate", "bead.toml"),

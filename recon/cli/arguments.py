@@ -32,23 +32,24 @@ def out(parser: argparse.ArgumentParser, what: str = "") -> None:
     what: the results are. Without --out they go beside the input, into a folder that is named after it and them; or,
     where there is no input, after the command.
     """
-    usual = f"beside the input, named after it: NAME_{what}" if what else parser.prog.rpartition(" ")[2]
-    parser.set_defaults(what=what, usual_out=usual)
+    name = parser.prog.rpartition(" ")[2]
+    usual = f"beside the input, named after it: NAME_{what}" if what else name
+    parser.set_defaults(usual_out=lambda options: beside(_input(options), f"_{what}") if what else Path(name))
     parser.add_argument("--out", type=_folder, metavar="DIR", help=f"folder for the results (default: {usual})")
 
 
 def choose_out(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Put in the usual folder where the user has named none; an error of the parser's where it can't be written to."""
-    if getattr(options, "usual_out", None) is None or options.out is not None:
+    if "usual_out" not in options or options.out is not None:
         return
-    name = options.usual_out
-    if options.what:
-        given: Path = options.config if "config" in options else options.image[0]
-        name = beside(given, f"_{options.what}")
     try:
-        options.out = _folder(str(name))
+        options.out = _folder(str(options.usual_out(options)))
     except argparse.ArgumentTypeError as error:
         parser.error(f"{error}; name another folder by --out")
+
+
+def _input(options: argparse.Namespace) -> Path:
+    return options.config if "config" in options else options.image[0]
 
 
 def out_if_wanted(parser: argparse.ArgumentParser) -> None:

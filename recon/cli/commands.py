@@ -17,9 +17,8 @@ from importlib import import_module
 from typing import NoReturn
 
 from recon.cli import arguments
+from recon.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from recon.report.terminal import write_plainly
-
-BAD_INPUT, INTERRUPTED = 2, 130
 
 
 @dataclass(frozen=True)
@@ -142,22 +141,17 @@ def main(typed: Sequence[str] | None = None) -> int:
     write_plainly()
     words = list(sys.argv[1:] if typed is None else typed)
     chosen = next((row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), None)
-    parser = _parser(chosen)
-    if chosen is None and words:
-        _check_command(words[0], parser)
-    try:
-        with interrupted_at_once():
-            options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
-            if chosen is None:
-                parser.error("a command is wanted; torchdic --help lists them")
-            arguments.choose_out(options, parser)
-            from recon.cli.running import run
+    with interrupted_at_once():
+        parser = _parser(chosen)
+        if chosen is None:
+            _check_command(words, parser)
+        options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
+        assert chosen is not None  # the parser has shown the help or the version else, and ended the program
+        arguments.choose_out(options, parser)
+        from recon.cli.running import run
 
-            import_module(chosen.module)
-    except KeyboardInterrupt:
-        print("torchdic: error: interrupted", file=sys.stderr)
-        return INTERRUPTED
-    return run(chosen.module, options)
+        command = import_module(chosen.module).run
+    return run(command, options)
 
 
 @contextmanager
@@ -182,8 +176,11 @@ def interrupted_at_once() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _check_command(word: str, parser: argparse.ArgumentParser) -> None:
-    """An error of the parser's where the first word is meant as a command, and isn't one."""
+def _check_command(words: Sequence[str], parser: argparse.ArgumentParser) -> None:
+    """An error of the parser's unless the words, of which none is a command, ask for what needs no command."""
+    if not words:
+        parser.error("a command is wanted; torchdic --help lists them")
+    word = words[0]
     if word in ("-h", "--help", "--version"):
         return
     if word.startswith("-"):

@@ -3,12 +3,13 @@
 import argparse
 import sys
 import warnings
-from importlib import import_module
+from collections.abc import Callable
 from typing import Any
 
 from tqdm import tqdm
 
 from recon.cli.doctor.selftest import SelfTestError
+from recon.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.run.checkpoint import CheckpointError, UnsavedWarning
 from recon.run.folder.index import leave_index
@@ -20,20 +21,18 @@ from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, Toler
 from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-
 # What the user can put right, in one line that says what.
 WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
 
 
-def run(module: str, options: argparse.Namespace) -> int:
-    """Run the command of a module with the user's options; returns the exit code, see `recon.cli.commands.main`."""
+def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespace) -> int:
+    """Run a command with the user's options; returns the exit code, see `recon.cli.commands.main`."""
     _show_each_warning_once()
     try:
         with folders_released():
             _hold_folder(options)
             try:
-                import_module(module).run(options)
+                command(options)
             except InterruptedRunError:
                 _leave_index(options)
                 raise

@@ -52,12 +52,10 @@ def _check_no_images(path: Path) -> None:
     """Raise ConfigError for what holds images instead of a configuration, with the command that makes one of them."""
     suffixes = tuple(suffix for known in FORMATS for suffix in known.suffixes)
     try:
-        path.stat()
+        folder = path.is_dir()
     except PermissionError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    except OSError:
-        pass  # the reader says what is wrong
-    kind = "a folder" if path.is_dir() else "an image" if path.name.lower().endswith(suffixes) else None
+    kind = "a folder" if folder else "an image" if path.name.lower().endswith(suffixes) else None
     if kind is not None and path.exists():
         raise ConfigError(
             f"{path}: is {kind}, not a configuration; torchdic new {path} --out run.toml writes one for a stack"

@@ -42,10 +42,6 @@ class Source:
         """The same, without a table."""
         return replace(self, values={name: value for name, value in self.values.items() if name != section})
 
-    def with_comments(self, comments: Mapping[str, str]) -> "Source":
-        """The same, with other comments."""
-        return replace(self, comments=comments)
-
 
 def rewritten(
     config: Config, folder: Path, source: Source, comments: Mapping[str, str], head: Sequence[str] = ()

@@ -59,11 +59,7 @@ def outcomes(device: torch.device) -> Iterator[Outcome]:
     yield Outcome("images against stored ones", float((found - stored).abs().max()), IMAGES)
     yield Outcome("gradient against finite differences", _gradient_error(), GRADIENT)
     recipe = Recipe(bounds=Bounds(0.0, None), steps=STEPS, tv=(0.1, 0.1))
-    data = stored.float()
-    last = None
-    for step in descend(data, GRID, BACKGROUND, MICROSCOPE, ACQUISITION, FIDELITY, recipe):
-        last = step
-    assert last is not None
+    *_, last = descend(stored, GRID, BACKGROUND, MICROSCOPE, ACQUISITION, FIDELITY, recipe)
     yield Outcome("misfit of a volume fitted to them", last.misfit, FIT)
 
 

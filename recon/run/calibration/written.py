@@ -38,7 +38,7 @@ def write_calibration(
     """
     orders, found = calibration.orders, calibration.found
     config = replace(calibration.config, calibration=CalibrationSection())
-    source = source.without("calibration").with_comments(corrected(source.comments, told.assumed))
+    source = replace(source.without("calibration"), comments=corrected(source.comments, told.assumed))
     comments = provenance(told, config, orders, found, source.comments)
     head = [f"Written by torchdic calibrate ({__version__}), which found:"]
     head += [f"  {quantity.words}" for quantity in found]
@@ -68,6 +68,6 @@ def _known_by_bead(found: Sequence[FoundQuantity]) -> CalibrationSection:
     unsure = {quantity.name: quantity for quantity in found if quantity.told}
     length = unsure[LENGTH]
     share = max(deviation / value for deviation, value in zip(length.uncertainty, length.value, strict=True))
-    within = Foreknowledge(share, *(max(unsure[name].uncertainty) for name in ("bias", DIRECTION))).limits
-    angles = (math.radians(rounded(math.degrees(min(angle, math.pi / 2)), 2)) for angle in within[1:])
-    return CalibrationSection(None, (), False, rounded(min(within[0], 0.99), 2), *angles)
+    within, *angles = Foreknowledge(share, *(max(unsure[name].uncertainty) for name in ("bias", DIRECTION))).limits
+    bias, angle = (math.radians(rounded(math.degrees(min(each, math.pi / 2)), 2)) for each in angles)
+    return CalibrationSection(length_within=rounded(min(within, 0.99), 2), bias_within=bias, angle_within=angle)
