@@ -45,6 +45,7 @@ RECON = (
     "fit",
     "earlier",
     "descend",
+    "tiling",
     "calibration",
     "coverage",
     "evidence",

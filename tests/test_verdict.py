@@ -266,6 +266,6 @@ def test_a_volume_that_is_full_of_the_other_sign_is_told(images, data, truth):
     """The ball less its own Δn everywhere gives the same images: a specimen above the medium, bounds below it."""
     rows = [(n, 0.5, 0.5, 1.0) for n in range(20)]
     problem = problem_of(data, bounds=Bounds(None, 0.0))
-    found = judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth - truth.max())
+    found = judged(problem, images, [NOISE] * 2, "newton", rows).with_volume(truth - truth.max())
     assert "the volume explains the stack; more than half of the volume has a Δn of about -0.02: images" in found.words
-    assert "more than half" not in judged(problem, images, [NOISE] * 2, "newton", rows, delta=truth).words
+    assert "more than half" not in judged(problem, images, [NOISE] * 2, "newton", rows).with_volume(truth).words

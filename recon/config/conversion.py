@@ -249,6 +249,7 @@ FIELDS: dict[type, dict[str, Hook]] = {
         "learn": _array_of(_string),
         "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
         "margin": _or("auto", _whole_number),
+        "tiles": _or("auto", lambda value, _: _optional(value, int | None)),
     },
     CalibrationSection: {"aberrations": _array_of(_whole_number)},
     WorkPrecisionSection: {

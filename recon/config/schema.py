@@ -172,6 +172,8 @@ class ReconstructionSection(Recipe):
     checkpoint_every: steps between two checkpoints.
     margin: voxels of specimen beyond the field of the images on each side, which the light from there asks for; "auto"
         adds them where the images show the specimen at their border.
+    tiles: voxels along a side of the overlapping tiles in which the field is fitted; "auto" cuts it where there is no
+        room to fit it whole, into tiles as large as memory allows; None never does.
     support: where Δn is sought; elsewhere it is 0. "edges" finds it from the edges in each focus plane; or the file of
         a mask, (z, y, x) or (y, x), 0 where there is none; a relative path starts from the configuration's folder.
         None is everywhere.
@@ -180,12 +182,17 @@ class ReconstructionSection(Recipe):
 
     checkpoint_every: int = 10
     margin: int | Literal["auto"] = "auto"
+    tiles: int | Literal["auto"] | None = "auto"
     support: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.margin, int) and self.margin < 0:
             raise ValueError(f"margin {self.margin} must be at least 0")
+        if isinstance(self.tiles, int) and self.tiles < 1:
+            raise ValueError(f"tiles {self.tiles} must be at least 1 voxel; 'none' cuts nothing")
+        if isinstance(self.tiles, int) and self.method in DIRECT:
+            raise ValueError(f"tiles {self.tiles}: method {self.method!r} solves the whole field at once; use 'newton'")
         if self.checkpoint_every < 1:
             raise ValueError(f"checkpoint_every {self.checkpoint_every} must be at least 1 step")
 

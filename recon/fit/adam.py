@@ -82,7 +82,7 @@ def _move(
     delta = setup.volume.delta.detach()
     if step > 0 and step % BETWEEN_WEIGHTS == 0:
         weights = _followed(problem, step, float(misfit.detach()), images.detach(), delta, weights)
-    found = contrast(delta) if step >= UNTIL_CONTRAST * problem.steps else 0.0
+    found = (problem.contrast or contrast(delta)) if step >= UNTIL_CONTRAST * problem.steps else 0.0
     priors = [prior.at_contrast(found) for prior in problem.priors]
     loss = misfit
     for weight, prior in weighted(priors, weights[-1]["tv"] if weights else 1.0, step, problem.steps):
@@ -99,7 +99,7 @@ def _first_weight(problem: Problem, unknowns: Unknowns) -> tuple[WeightRecord, .
     if rule is None:
         return ()
     found = contrast(unknowns.into(problem.setup).volume.delta.detach())
-    first = rule.first if rule.first is not None else BEGUN / max(found, 1e-4)
+    first = rule.first if rule.first is not None else BEGUN * problem.setup.dilution / max(found, 1e-4)
     return (record(0, first, "by the contrast"),)
 
 
@@ -115,6 +115,6 @@ def _followed(
     before = weights[-1]["misfit"]
     if math.isnan(before):
         before = math.inf if step < UNTIL_CONTRAST * problem.steps else None
-    white, width = whiteness(images, problem.misfit), EDGE * max(contrast(delta), 1e-9)
+    white, width = whiteness(images, problem.misfit), EDGE * max(contrast(delta), 1e-9) / problem.setup.dilution
     weight, reason = problem.weight.next(weights, misfit, before, white, width)
     return (*weights, record(step + 1, weight, reason, misfit, white))

@@ -134,7 +134,8 @@ class Problem:
     setup: the volume, microscope and acquisition as far as they are known; the unknowns replace parts of it.
     misfit: holds the measured images. unknowns: what is sought. priors: what is added to the misfit, in this order.
     fidelity: of the images at each step. steps: how many there are at most. method: of the descent, "newton" or "adam".
-    weight: a common factor of the priors that follows the noise; None is 1.
+    weight: a common factor of the priors that follows the noise; None is 1. contrast: the specimen's typical Δn, which
+    the priors go by where it is known from elsewhere; None is that of the volume as it is found.
     Raises ValueError where the data's shape is not that of the setup's images, or two unknowns share a name.
     """
 
@@ -146,6 +147,7 @@ class Problem:
     steps: int
     method: str = "adam"
     weight: FollowsNoise | None = None
+    contrast: float | None = None
 
     def __post_init__(self) -> None:
         expected, found = self.setup.shape, tuple(self.misfit.data.shape)

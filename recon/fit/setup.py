@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchdic import Acquisition, Fidelity, Grid, Microscope, Volume, image
@@ -56,6 +56,15 @@ class Setup:
         return self.volume.grid.widened(-self.margin, -self.margin)
 
     @property
+    def dilution(self) -> float:
+        """Voxels of the volume for each of the field's.
+
+        Priors are means over all voxels, misfits over the field's pixels: a weight means this many times as much
+        without the margin.
+        """
+        return math.prod(self.volume.grid.shape[1:]) / math.prod(self.field.shape[1:])
+
+    @property
     def sees_voxels(self) -> bool:
         """Whether the images' pixels are voxels, not those of a camera."""
         camera = self.microscope.camera
@@ -95,7 +104,7 @@ class Setup:
             images = self.within_field(images)
         return self._lit(images)
 
-    def within_field(self, values: Float[Tensor, "*axes row column"]) -> Float[Tensor, "*axes y x"]:
+    def within_field(self, values: Shaped[Tensor, "*axes row column"]) -> Shaped[Tensor, "*axes y x"]:
         """Values of the volume's pixels or voxels, without those of the margin."""
         within = slice(self.margin, -self.margin or None)
         return values[..., within, within]

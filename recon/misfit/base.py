@@ -49,6 +49,8 @@ class Misfit(ABC):
     mask: the pixels that count (True), given as boolean and broadcastable to the data; None is all of them. The others
     count in no mean and have neither gradient nor curvature.
     variance: each prism's spatial variance, shape (prism, 1, 1, 1).
+    unit: a misfit of the same kind whose scale this one has, so that images of a part of the same field count alike,
+    and may be uniform; None is its own.
     Raises ValueError where the data don't have four axes, a pixel that counts isn't finite, the images of a prism are
     uniform or without a pixel that counts, or the mask isn't boolean or doesn't fit the data.
     """
@@ -59,7 +61,7 @@ class Misfit(ABC):
     mask: Bool[Tensor, "prism focus y x"] | None
     variance: Float[Tensor, "prism 1 1 1"]
 
-    def __init__(self, data: Tensor, mask: Tensor | None = None) -> None:
+    def __init__(self, data: Tensor, mask: Tensor | None = None, unit: "Misfit | None" = None) -> None:
         if data.ndim != 4:
             raise ValueError(f"the data have shape {tuple(data.shape)}, a misfit asks for (prism, focus, y, x)")
         self.mask = None if mask is None else _fitted(mask, data)
@@ -67,7 +69,12 @@ class Misfit(ABC):
         if number := int(unknown.sum()):
             raise ValueError(f"{number} of {data.numel()} pixels are not finite; a mask must leave them out")
         self.data = data if self.mask is None else filled(data, self.mask)
-        self.variance = spatial_variance(self.data, self.mask)[:, None, None, None]
+        if unit is not None and type(unit) is not type(self):
+            raise ValueError(f"a misfit of the kind {self.name} has no scale of the kind {unit.name}")
+        if unit is None:
+            self.variance = spatial_variance(self.data, self.mask)[:, None, None, None]
+        else:
+            self.variance = unit.variance
 
     @property
     def pixels(self) -> Float[Tensor, " prism"]:
@@ -93,6 +100,17 @@ class Misfit(ABC):
     def mean(self, values: Float[Tensor, "prism focus y x"]) -> Float[Tensor, ""]:
         """Mean of values over all pixels that count."""
         return values.mean() if self.mask is None else self.where_counted(values).sum() / self.pixels.sum()
+
+    def part(self, rows: slice, columns: slice, unit: "Misfit | None" = None) -> "Misfit":
+        """The misfit of a part of the images. rows, columns: of their pixels. unit: as above.
+
+        Raises ValueError where no pixel of a prism counts there, NotImplementedError for a kind that has no parts.
+        """
+        raise NotImplementedError(f"a misfit of the kind {self.name} can't be cut into tiles")
+
+    def _mask_of_part(self, rows: slice, columns: slice) -> Bool[Tensor, "prism focus y x"] | None:
+        """The mask of a part of the images."""
+        return None if self.mask is None else self.mask[..., rows, columns]
 
     @abstractmethod
     def __call__(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, ""]:

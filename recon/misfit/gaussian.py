@@ -22,14 +22,16 @@ class GaussianMisfit(Misfit):
     the pixel, it would be too small where noise has made the pixel too dark, and the fit would follow the dark pixels:
     by one photon a pixel, whatever the brightness. Neighbours know nothing of a pixel's noise, so nothing is biased.
 
-    data, mask: as of any misfit. noise: in the unit of the data; it broadcasts to them.
+    data, mask, unit: as of any misfit. noise: in the unit of the data; it broadcasts to them.
     Raises ValueError as any misfit does, and where the noise model doesn't fit the data.
     """
 
     name = "gaussian"
 
-    def __init__(self, data: Tensor, noise: NoiseModel | None = None, mask: Tensor | None = None) -> None:
-        super().__init__(data, mask)
+    def __init__(
+        self, data: Tensor, noise: NoiseModel | None = None, mask: Tensor | None = None, unit: Misfit | None = None
+    ) -> None:
+        super().__init__(data, mask, unit)
         self.noise = noise
         if noise is None:
             return
@@ -37,11 +39,17 @@ class GaussianMisfit(Misfit):
         level, number = neighbours(self.data, self.mask)
         variance = model.variance(torch.maximum(level, model.gain))
         empty = image_means(self.data, self.mask, 1 / variance)
-        self._empty = self.mean((self.data - empty).square() / variance)
+        own = self.mean((self.data - empty).square() / variance)
+        self._empty = unit._empty if isinstance(unit, GaussianMisfit) else own
         self._divisor = variance * self._empty
         # the mean of 1/variance is a little more than 1 over the mean, because the neighbours are noisy too
         scatter = model.gain.square() * model.variance(level) / number.clamp_min(1)
         self._noise_alone = self.mean(model.variance(level) / variance + scatter / variance.square())
+
+    def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "GaussianMisfit":
+        """The misfit of a part of the images, see `Misfit.part`."""
+        noise = None if self.noise is None else self.noise.part(rows, columns)
+        return GaussianMisfit(self.data[..., rows, columns], noise, self._mask_of_part(rows, columns), unit)
 
     def __call__(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, ""]:
         """The misfit of modelled images, in the unit of the data; differentiable."""

@@ -30,21 +30,27 @@ class PoissonMisfit(Misfit):
     as 0: this adds a constant, and the deviance's slope, 2(1 − n/μ), stays without bias. Below the μ of darkness, or a
     hundredth of a photon, the deviance goes on as the parabola of the same slope and of that variance.
 
-    data, mask: as of any misfit. noise: in the unit of the data; it broadcasts to them.
+    data, mask, unit: as of any misfit. noise: in the unit of the data; it broadcasts to them.
     Raises ValueError as any misfit does, and where the noise model doesn't fit the data.
     """
 
     name = "poisson"
 
-    def __init__(self, data: Tensor, noise: NoiseModel, mask: Tensor | None = None) -> None:
-        super().__init__(data, mask)
+    def __init__(self, data: Tensor, noise: NoiseModel, mask: Tensor | None = None, unit: Misfit | None = None) -> None:
+        super().__init__(data, mask, unit)
         self.noise = noise
         self._model = noise.like(self.data)
         self._read = (self._model.read / self._model.gain).square()
         self._darkest = self._read.clamp_min(_DARKEST)
         self._counts = self._photons(self.data)
         uniform = image_means(self.data, self.mask).expand_as(self.data)
-        self._empty = self.mean(deviance(self._counts, self._photons(uniform), self._darkest))
+        empty = deviance(self._counts, self._photons(uniform), self._darkest)
+        self._empty = unit._empty if isinstance(unit, PoissonMisfit) else self.mean(empty)
+
+    def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "PoissonMisfit":
+        """The misfit of a part of the images, see `Misfit.part`."""
+        noise = self.noise.part(rows, columns)
+        return PoissonMisfit(self.data[..., rows, columns], noise, self._mask_of_part(rows, columns), unit)
 
     def __call__(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, ""]:
         """The misfit of modelled images, in the unit of the data; differentiable."""

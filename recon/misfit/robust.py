@@ -23,16 +23,22 @@ class RobustMisfit(Misfit):
     1964), so that a hot pixel or a grain of dust pulls no more than noise does, however bright it is. It is convex in
     the images: unlike a loss that forgets far residuals, it doesn't take the specimen for outliers before it is fitted.
 
-    data, mask: as of any misfit. noise: standard deviation of each prism's noise, shape (prism,), in the unit of the
-    data; None measures it in the data, by the median magnitude of what remains of a pixel beside its neighbours.
+    data, mask, unit: as of any misfit. noise: standard deviation of each prism's noise, shape (prism,), in the unit of
+    the data; None measures it in the data, by the median magnitude of what remains of a pixel beside its neighbours.
     Raises ValueError as any misfit does, where the noise isn't one number above 0 per prism, or can't be measured.
     """
 
     name = "robust"
     knows_all = False
 
-    def __init__(self, data: Tensor, noise: Float[Tensor, " prism"] | None = None, mask: Tensor | None = None) -> None:
-        super().__init__(data, mask)
+    def __init__(
+        self,
+        data: Tensor,
+        noise: Float[Tensor, " prism"] | None = None,
+        mask: Tensor | None = None,
+        unit: Misfit | None = None,
+    ) -> None:
+        super().__init__(data, mask, unit)
         noise = _measured(self.data, self.mask) if noise is None else noise.to(self.data)
         if noise.shape != self.data.shape[:1]:
             raise ValueError(f"the noise has shape {tuple(noise.shape)}, the data have {len(self.data)} prisms")
@@ -40,7 +46,10 @@ class RobustMisfit(Misfit):
             if not 0 < value < math.inf:
                 raise ValueError(f"the noise {value:g} of prism {prism + 1} must be above 0 and finite")
         self.noise = noise
-        self._set_scale(noise)
+        if isinstance(unit, RobustMisfit):
+            self._scale, self._empty = unit._scale, unit._empty
+        else:
+            self._set_scale(noise)
 
     def _set_scale(self, scale: Float[Tensor, " prism"]) -> None:
         """Standardise residuals by a scale per prism."""
@@ -48,6 +57,10 @@ class RobustMisfit(Misfit):
         medians = torch.stack([image.nanmedian() for image in self._known(self.data).flatten(0, 1)])
         uniform = medians.nan_to_num(0).reshape(*self.data.shape[:2], 1, 1)  # an image without pixels has no median
         self._empty = self.mean(huber((self.data - uniform) / self._scale))
+
+    def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "RobustMisfit":
+        """The misfit of a part of the images, see `Misfit.part`."""
+        return RobustMisfit(self.data[..., rows, columns], self.noise, self._mask_of_part(rows, columns), unit)
 
     def rescaled(self, images: Float[Tensor, "prism focus y x"]) -> "RobustMisfit":
         """The same misfit with each prism's scale from the median magnitude of the images' residual.

@@ -54,6 +54,10 @@ class NoiseModel:
         """The model of the same images after a division by `unit`, which is above 0."""
         return NoiseModel(self.gain / unit, self.read / unit)
 
+    def part(self, rows: slice, columns: slice) -> "NoiseModel":
+        """The model of a part of the images: of their rows and columns."""
+        return NoiseModel(*(_part(value, rows, columns) for value in (self.gain, self.read)))
+
     def like(self, data: Float[Tensor, "prism focus y x"]) -> "TensorNoise":
         """The same with the data's dtype and device. Raises ValueError where it doesn't broadcast to their shape."""
         tensors = [torch.as_tensor(value, dtype=data.dtype, device=data.device) for value in (self.gain, self.read)]
@@ -71,6 +75,16 @@ class TensorNoise(NoiseModel):
 
     gain: Tensor
     read: Tensor
+
+
+def _part(value: float | Tensor, rows: slice, columns: slice) -> float | Tensor:
+    """What of a value that broadcasts to images broadcasts to a part of them."""
+    if not isinstance(value, Tensor):
+        return value
+    for axis, within in ((-2, rows), (-1, columns)):
+        if value.ndim >= -axis and value.shape[axis] > 1:
+            value = value.movedim(axis, 0)[within].movedim(0, axis)
+    return value
 
 
 def noise_of_level(

@@ -101,6 +101,11 @@ class Verdict:
         unfinished = bool(self.causes) and self.causes[0].name == FEW
         return self.poor and (self.misfit > 1 or (self.expected and not unfinished))
 
+    def with_volume(self, delta: Float[Tensor, "z y x"]) -> "Verdict":
+        """The verdict with what the volume itself says: whether most of it isn't the medium."""
+        median = float(delta.median())
+        return replace(self, filled=median if abs(median) > FILLED * float(delta.abs().max()) else None)
+
     @property
     def words(self) -> str:
         """The verdict in one line."""
@@ -197,30 +202,30 @@ def judged(
     method: str,
     rows: Sequence[Row],
     assumed: Sequence[str] = (),
-    delta: Float[Tensor, "z row column"] | None = None,
+    part: Problem | None = None,
 ) -> Verdict:
     """The verdict on a finished fit; where it is poor, causes are looked for, which takes as long as some steps.
 
     images: the model's, of the last step. noise: standard deviation of each prism's, None where it isn't known.
     method: that found the volume. rows: of the log. assumed: what nobody has said, by the names of a configuration's
-    `assumed`. delta: the volume's; None doesn't look at it.
+    `assumed`. part: of the problem, in which the causes are looked for where all of it is too large; None is all.
     """
     misfit = float(problem.misfit(images))
     alone = problem.misfit.of_noise(noise) if noise is not None or problem.misfit.knows_all else None
     index = next((unknown for unknown in problem.unknowns if isinstance(unknown, IndexDifference)), None)
     free = index is not None and _free(index.bounds)
     white = whiteness(images, problem.misfit)
-    filled = None if delta is None else _filling(delta)
-    found = Verdict(misfit, alone, white, (), free, method not in DIRECT, tuple(assumed), filled)
+    found = Verdict(misfit, alone, white, (), free, method not in DIRECT, tuple(assumed))
+    part = part or problem
     if not found.expected:
         return found
     if found.poor:
-        return replace(found, causes=_causes(problem, images, found, rows))
+        return replace(found, causes=_causes(problem, part, images, found, rows))
     structured = noise is not None and _structured(problem, images, noise)
-    if structured and (len(rows) >= FEW_STEPS or not rows) and can_be_tried(problem):
+    if structured and (len(rows) >= FEW_STEPS or not rows) and can_be_tried(part):
         print("the residual has structure: short fits of what may have been declared wrongly …")
         # a volume without priors follows the noise more closely in any case
-        causes = [cause for cause in _tried(problem, found, SURE) if cause.name != PRIORS]
+        causes = [cause for cause in _tried(part, found, SURE) if cause.name != PRIORS]
         return replace(found, causes=ranked(causes, found.assumed))
     return found
 
@@ -236,15 +241,15 @@ def _structured(problem: Problem, images: Tensor, noise: Sequence[float]) -> boo
     return power > STRUCTURE and (power - 1) / COARSE**2 * share > LEAST * max(1 - share, 0.0)
 
 
-def _causes(problem: Problem, images: Tensor, found: Verdict, rows: Sequence[Row]) -> tuple[Cause, ...]:
-    """What may be wrong with a poor fit, the likeliest first. found: the verdict without them."""
+def _causes(problem: Problem, part: Problem, images: Tensor, found: Verdict, rows: Sequence[Row]) -> tuple[Cause, ...]:
+    """What may be wrong with a poor fit, the likeliest first. part: as in `judged`. found: the verdict without them."""
     noise = found.noise or 0.0
     causes = list(_unfinished(rows))
     if len(rows) >= FEW_STEPS or not rows:
         causes += seen_in_residual(images, problem.misfit, noise, problem.setup.margin)
-        if can_be_tried(problem):
+        if can_be_tried(part):
             print("the misfit is far above the noise's: short fits of what may have been declared wrongly …")
-            causes += _tried(problem, found)
+            causes += _tried(part, found)
     return ranked(causes, found.assumed)
 
 
@@ -270,12 +275,6 @@ def _unfinished(rows: Sequence[Row]) -> list[Cause]:
             reason = f"the last step lowered the misfit by {1 - last / before:.0%}"
             return [Cause(FEW, 0.3, reason, "let it take more: reconstruction.steps")]
     return []
-
-
-def _filling(delta: Float[Tensor, "z y x"]) -> float | None:
-    """The median of Δn where most of the volume isn't the medium; else None."""
-    median = float(delta.median())
-    return median if abs(median) > FILLED * float(delta.abs().max()) else None
 
 
 def _free(bounds: Bounds) -> bool:

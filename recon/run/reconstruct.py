@@ -29,6 +29,9 @@ from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped
 from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import check_room_for_descent, check_room_for_volume
+from recon.run.tiles.fitting import TiledFit
+from recon.run.tiles.kept import TILES, forget, remember_side
+from recon.run.tiles.sizes import Cut, cut_of
 from torchdic import Fidelity
 
 # Without a [fidelity] section. Newton's steps are computed with few directions and corrected to these images, whose
@@ -36,6 +39,9 @@ from torchdic import Fidelity
 # the error of a first-order split step is below that of its directions and of the voxels.
 RECOMMENDED = Fidelity("wave", sources=128, padding=8)
 RECOMMENDED_FOR_ADAM = Fidelity("wave", order=1)
+
+# What ends a message about results that can't be written.
+GO_ON = "; make room and go on with --resume"
 
 # Pixels along a side of a field that is too small to tell whether the specimen goes on beyond it.
 LEAST_FIELD = 24
@@ -59,28 +65,54 @@ def reconstruct(
     ShortOfMemoryError where there is no room for the descent, before `out` is touched; InterruptedRunError on Ctrl-C,
     with a checkpoint and the volume so far saved; ResultsError where results cannot be written.
     """
+    budget = None if config.fidelity is None else config.fidelity.memory
     config, measured, made, problem, identity = _asked(config, device, misfit)
     start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
-    sections = None
     if config.reconstruction.method in DIRECT:
-        try:
-            step, sections = solved_directly(config.reconstruction, problem, measured.noise)
-        except ValueError as error:
-            raise ConfigError(f"reconstruction.method: {config.reconstruction.method!r}: {error}") from error
-        prepare_folder(out)
-        ended = Checkpoint(step, [], identity)
-    else:
+        return _solved(config, measured, problem, out, identity)
+    if restart:
+        forget(out)
+    cut = None
+    if start is None:
+        cut = cut_of(config, problem, made, out, budget)
+    else:  # a field of which a fit is under way stays whole
         check_room_for_descent(problem, made)
-        prepare_folder(out)
-        ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
-    kept = config.reconstruction.method not in DIRECT and save_if_possible(out / CHECKPOINT, ended)
+    prepare_folder(out)
+    if cut is not None:
+        return _in_tiles(config, measured, problem, cut, out, identity)
+    ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
+    kept = save_if_possible(out / CHECKPOINT, ended)
     try:
-        return write_results(out, config, measured, problem, ended, sections)
+        return write_results(out, config, measured, problem, ended)
     except ResultsError as error:
-        raise ResultsError(f"{error}{'; make room and go on with --resume' if kept else ''}") from error
+        raise ResultsError(f"{error}{GO_ON if kept else ''}") from error
     except STOPPING as error:  # the images by which the volume is judged have no room, or can't be followed
         error.args = (f"{error}; {leave_stopped(out, problem, ended)}",)
         raise
+
+
+def _solved(config: Config, measured: Measured, problem: Problem, out: Path, identity: str) -> Result:
+    """The results of a method without a descent, written into `out`."""
+    try:
+        step, sections = solved_directly(config.reconstruction, problem, measured.noise)
+    except ValueError as error:
+        raise ConfigError(f"reconstruction.method: {config.reconstruction.method!r}: {error}") from error
+    prepare_folder(out)
+    return write_results(out, config, measured, problem, Checkpoint(step, [], identity), sections)
+
+
+def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out: Path, identity: str) -> Result:
+    """The results of a fit by tiles, which are removed once those are written."""
+    problem, layout = cut.problem(whole), cut.layout
+    remember_side(out, layout.side, cut.memory)
+    tiled = TiledFit(problem, layout, measured.noise, out, identity, config.reconstruction.checkpoint_every).fitted()
+    config = replace(config, reconstruction=replace(config.reconstruction, tiles=layout.side))
+    try:
+        result = write_results(out, config, measured, problem, tiled.ended, tiled=tiled)
+    except ResultsError as error:
+        raise ResultsError(f"{error}{GO_ON}") from error
+    forget(out)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +145,10 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
     config, measured, misfit, problem, identity = _asked(load(resolved), device)
     if config.reconstruction.method in DIRECT:
         step, _ = solved_directly(config.reconstruction, problem, measured.noise)
+    elif isinstance(config.reconstruction.tiles, int) and not (out / CHECKPOINT).exists():
+        raise ConfigError(
+            f"{out}: was fitted by tiles, and the fit is done again whole: fit a part of the field by itself"
+        )
     elif (out / CHECKPOINT).exists():
         step = checkpoint.load(out / CHECKPOINT, identity).step
         step = replace(step, delta=step.delta.to(device))
@@ -209,6 +245,10 @@ def _checkpoint_to_resume(out: Path, identity: str, *, resume: bool) -> Checkpoi
 
     Raises CheckpointError or FinishedError where the folder holds an earlier run, and the user must choose.
     """
+    if (out / TILES).exists():
+        if resume:
+            return None
+        raise CheckpointError(f"{out / TILES}: an interrupted run; go on with --resume, or begin anew with --restart")
     saved, finished = out / CHECKPOINT, (out / METRICS).exists() and not (out / INTERRUPTED).exists()
     if saved.exists():
         if resume:

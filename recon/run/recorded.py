@@ -1,5 +1,6 @@
 """A descent that leaves a log and checkpoints in a folder, so that it may be interrupted and resumed."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from tqdm import tqdm
@@ -22,13 +23,23 @@ LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
 
 
+# Leaves the volume of a step at which a descent was stopped, and says in words where. Raises StackError.
+Leave = Callable[[Step], str]
+
+
 def descend_recorded(
-    problem: Problem, out: Path, checkpoint_every: int, identity: str, start: Checkpoint | None = None
+    problem: Problem,
+    out: Path,
+    checkpoint_every: int,
+    identity: str,
+    start: Checkpoint | None = None,
+    leave: Leave | None = None,
 ) -> Checkpoint:
     """Take the steps of a problem, with a progress bar; returns the last one, with all rows of the log.
 
     out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
-    depends on, for the checkpoint. start: to go on from.
+    depends on, for the checkpoint. start: to go on from. leave: leaves the volume where the descent is stopped; None
+    leaves it in the folder.
     Raises InterruptedRunError on Ctrl-C or SIGTERM, and what a step raises, FloatingPointError where the fit diverges;
     with a checkpoint and the volume of the last good step saved. Warns UnsavedWarning where the log or a checkpoint
     cannot be written.
@@ -61,20 +72,20 @@ def descend_recorded(
             log.add(step.row)  # the signal may have come between the step and its row
             stopped = Checkpoint(step, log.rows, identity)
             line = f"interrupted after step {step.number} of {problem.steps}"
-            raise InterruptedRunError(f"{line}; {leave_stopped(out, problem, stopped)}") from None
+            raise InterruptedRunError(f"{line}; {leave_stopped(out, problem, stopped, leave)}") from None
         except STOPPING as error:
             kept = good if isinstance(error, FloatingPointError) else step
             if kept is None:
                 raise
             stopped = Checkpoint(kept, [row for row in log.rows if row[0] <= kept.number], identity)
-            line = f"stopped after step {kept.number} of {problem.steps}; {leave_stopped(out, problem, stopped)}"
+            line = f"stopped after step {kept.number} of {problem.steps}; {leave_stopped(out, problem, stopped, leave)}"
             error.args = (f"{error}; {line}",)
             raise
         assert step is not None
         return Checkpoint(step, log.rows, identity)
 
 
-def leave_stopped(out: Path, problem: Problem, stopped: Checkpoint) -> str:
+def leave_stopped(out: Path, problem: Problem, stopped: Checkpoint, leave: Leave | None = None) -> str:
     """Leave a checkpoint and the volume of a descent that came to no end; returns a line about them for the user."""
     try:
         save(out / CHECKPOINT, stopped)
@@ -82,6 +93,17 @@ def leave_stopped(out: Path, problem: Problem, stopped: Checkpoint) -> str:
     except WriteError as error:
         line = str(error)
     try:
-        return f"{line}; {leave_interrupted(out, problem, stopped.step).name} holds Δn so far"
+        return f"{line}; {(leave or _leaving(out, problem))(stopped.step)}"
     except StackError as error:
         return f"{line}; {error}"
+
+
+def _leaving(out: Path, problem: Problem) -> Leave:
+    """What leaves the volume of a problem's step in a folder, see `Leave`."""
+
+    def leave(step: Step) -> str:
+        delta = problem.setup.within_field(step.delta).detach().cpu()
+        path = leave_interrupted(out, delta, problem.setup.field, f"delta n, interrupted after step {step.number}")
+        return f"{path.name} holds Δn so far"
+
+    return leave

@@ -40,6 +40,20 @@ class ResultsError(ValueError):
     """Results cannot be written: one line with the files and the reason."""
 
 
+@dataclass(frozen=True, eq=False)
+class Tiled:
+    """A field that was fitted tile by tile.
+
+    ended: the first tile's last step, with the whole field's Δn and the seconds of all tiles, and its log. images: the
+    model's, of the whole field. first: the first tile's problem. record: of the tiles, for metrics.json.
+    """
+
+    ended: Checkpoint
+    images: Float[Tensor, "prism focus y x"]
+    first: Problem
+    record: dict[str, Any]
+
+
 @dataclass(frozen=True)
 class Result:
     """What a reconstruction leaves: Δn (z, y, x) and its metrics, as in metrics.json."""
@@ -61,11 +75,12 @@ def metrics(
     images: Float[Tensor, "prism focus y x"],
     measured: Measured,
     method: str,
+    tiled: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The numbers of metrics.json.
 
     images: the model's, of the last step. measured: what the preparation found in the stack, such as the standard
-    deviation of each prism's noise. method: that found the step.
+    deviation of each prism's noise. method: that found the step. tiled: the record of a fit by tiles.
     """
     out = measured.left_out
     delta = problem.setup.within_field(last.delta)
@@ -85,6 +100,8 @@ def metrics(
     if last.weights:
         found["tv"] = last.weights[-1]["tv"]
         found["weights"] = [{k: _known(v) for k, v in record.items()} for record in last.weights]
+    if tiled is not None:
+        found["tiles"] = tiled
     if problem.setup.margin > 0:
         found["margin"] = problem.setup.margin
     if problem.support is not None:
@@ -134,18 +151,21 @@ def write_results(
     problem: Problem,
     ended: Checkpoint,
     sections: Float[Tensor, "focus y x"] | None = None,
+    tiled: Tiled | None = None,
 ) -> Result:
     """Write a finished descent's volume, metrics, resolved configuration and figures into a folder.
 
-    sections: optical path lengths in µm, where the method gives them.
+    sections: optical path lengths in µm, where the method gives them. tiled: the fit where it was one of tiles.
     Raises ResultsError where some of them cannot be written; the others are.
     """
     last, grid = ended.step, problem.setup.field
-    images, data = model_images(problem, last), problem.misfit.data.cpu()
+    data = problem.misfit.data.cpu()
+    images = model_images(problem, last) if tiled is None else tiled.images.to(problem.misfit.data.device)
     delta = problem.setup.within_field(last.delta).cpu()
-    found = metrics(problem, last, images, measured, config.reconstruction.method)
     method = config.reconstruction.method
-    verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, delta)
+    found = metrics(problem, last, images, measured, method, None if tiled is None else tiled.record)
+    part = None if tiled is None else tiled.first
+    verdict = judged(problem, images, measured.noise, method, ended.rows, config.assumed, part).with_volume(delta)
     found["verdict"] = verdict.as_json()
     tell(verdict)
     found["seen"] = tell_seen(config, measured, delta)
@@ -181,14 +201,14 @@ def write_results(
     return Result(delta, found)
 
 
-def leave_interrupted(out: Path, problem: Problem, step: Step) -> Path:
+def leave_interrupted(out: Path, delta: Float[Tensor, "z y x"], field: Grid, told: str) -> Path:
     """Write the volume of an interrupted descent, to be looked at; returns its file.
 
-    It is the usual one, unless the folder has the results of a finished descent. Raises StackError.
+    It is the usual one, unless the folder has the results of a finished descent. told: the name of its channel.
+    Raises StackError.
     """
     path = out / (INTERRUPTED if (out / METRICS).exists() else VOLUME)
-    delta = problem.setup.within_field(step.delta).detach().cpu()
-    _write_volume(path, delta, problem.setup.field, f"delta n, interrupted after step {step.number}")
+    _write_volume(path, delta, field, told)
     return path
 
 

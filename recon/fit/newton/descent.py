@@ -368,7 +368,7 @@ class _Descent:
     def first_weight(self, scale: float) -> float:
         """The priors' weight at first, for a specimen of a contrast."""
         first = None if self.problem.weight is None else self.problem.weight.first
-        return first if first is not None else BEGUN / scale
+        return first if first is not None else BEGUN * self.problem.setup.dilution / scale
 
     def turned(self, place: Place, draft: Fidelity, exact: Fidelity | None) -> tuple[Place, WeakHessian, Judged]:
         """A place whose images are computed otherwise from now on: what belongs to the earlier ones is forgotten."""
@@ -397,7 +397,7 @@ class _Descent:
         """The place with the priors' contrast and weight for the next step."""
         if place.moved and place.accepted >= UNTIL_CONTRAST:
             width = max(1.0, NARROWER * place.width) if place.known else WIDE
-            found = contrast(place.delta)
+            found = self.problem.contrast or contrast(place.delta)
             if found > 0 and (not place.known or place.width > 1.0):
                 place = replace(place, known=True, width=width, scale=found)
         rule = self.problem.weight
@@ -405,7 +405,9 @@ class _Descent:
             return place
         white = whiteness(now.images, self.problem.misfit)
         past = place.records or (record(0, place.weight, "by the contrast"),)
-        weight, reason = rule.next(past, now.misfit, place.before, white, EDGE * place.scale)
+        weight, reason = rule.next(
+            past, now.misfit, place.before, white, EDGE * place.scale / self.problem.setup.dilution
+        )
         made = record(number + 1, weight, reason, now.misfit, white)
         return replace(place, weight=weight, records=(*place.records, made))
 
@@ -476,13 +478,19 @@ class _Descent:
 
     def steady(self, place: Place, number: int) -> bool:
         """Whether the priors' weights have all but stopped moving."""
-        if self.problem.weight is None:
+        if self.problem.weight is None or self.problem.weight.held:
             now, last = (self.priors(place, step) for step in (number, self.problem.steps - 1))
             return [weight for weight, _ in now] == [weight for weight, _ in last]
         if len(place.records) < 2:
             return False
         last, previous = place.records[-1]["tv"], place.records[-2]["tv"]
         return abs(math.log(last / previous)) < STEADY
+
+
+def known_contrast(last: Step) -> float:
+    """The specimen's contrast as a descent's priors knew it in the end, or that of its last volume."""
+    newton = last.state.get("newton")
+    return newton["scale"] if newton is not None and newton["known"] else contrast(last.delta)
 
 
 def _state(place: Place) -> dict[str, dict[str, Any]]:

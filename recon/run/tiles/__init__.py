@@ -1,0 +1,1 @@
+"""Reconstructions of fields that are larger than memory, tile by tile."""

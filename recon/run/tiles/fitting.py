@@ -1,0 +1,152 @@
+"""A field fitted tile by tile, and what its tiles say together."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from recon.fit.problem import Problem
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference
+from recon.run.checkpoint import Checkpoint
+from recon.run.interruption import InterruptedRunError
+from recon.run.recorded import STOPPING, descend_recorded
+from recon.run.results import ResultsError, Tiled, leave_interrupted, model_images
+from recon.run.tiles.kept import begun, folder_of, identity_of, keep, kept
+from recon.tiling.blending import blended_images, blended_volume
+from recon.tiling.layout import Layout, Tile
+from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first
+from torchdic.files.whole import WriteError
+
+
+@dataclass(frozen=True, eq=False)
+class TiledFit:
+    """A field that is fitted tile by tile.
+
+    whole: the problem of the field, without a margin. layout: of its tiles. noise: standard deviation of each prism's;
+    None isn't known. out: folder of the results. identity: what the fit depends on. checkpoint_every: steps between
+    two checkpoints of a tile.
+    """
+
+    whole: Problem
+    layout: Layout
+    noise: Sequence[float] | None
+    out: Path
+    identity: str
+    checkpoint_every: int
+
+    @cached_property
+    def tiles(self) -> tuple[Tile, ...]:
+        """The tiles in which there is something to fit, in the order in which they are; a line names the others."""
+        found = []
+        for tile in strongest_first(self.layout, self.whole.misfit):
+            reason = lacks(self.whole, self.layout, tile)
+            if reason is None:
+                found.append(tile)
+            else:
+                print(f"tile {tile}: {reason}: Δn stays 0 there")
+        return tuple(found)
+
+    def fitted(self) -> Tiled:
+        """Fit the tiles that have yet to be fitted, and put all of them together.
+
+        Raises as `descend_recorded` does, with the tile's checkpoint and the volume of the fitted tiles left in the
+        folder, and ResultsError where a fitted tile can't be kept.
+        """
+        for number, tile in enumerate(self.tiles, 1):
+            if self.kept(tile) is None:
+                print(f"tile {tile}, {number} of {len(self.tiles)}")
+                self.fit(tile)
+        return self.together()
+
+    def fit(self, tile: Tile) -> None:
+        """Fit one tile and keep it. Raises as `fitted` does."""
+        folder, identity, problem = folder_of(self.out, tile), self.identity_of(tile), self.problem(tile)
+        folder.mkdir(parents=True, exist_ok=True)
+        start = begun(folder, identity)
+
+        def leave(step: Step) -> str:
+            return self.leave_so_far(tile, step)
+
+        try:
+            ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave)
+        except InterruptedRunError as error:
+            raise InterruptedRunError(f"tile {tile}: {error}") from None
+        except STOPPING as error:
+            error.args = (f"tile {tile}: {error}",)
+            raise
+        try:
+            keep(folder, ended)
+        except WriteError as error:
+            raise ResultsError(f"{error}; make room and go on with --resume") from error
+
+    def kept(self, tile: Tile) -> Checkpoint | None:
+        """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
+        return kept(folder_of(self.out, tile), self.identity_of(tile))
+
+    def identity_of(self, tile: Tile) -> str:
+        """What a tile's fit depends on."""
+        shared = "" if tile == self.tiles[0] else f"weight {self.shared.weight}, contrast {self.shared.contrast}"
+        return identity_of(self.identity, self.layout, tile, self.whole.steps, shared)
+
+    @cached_property
+    def shared(self) -> SharedByTiles:
+        """What the first tile, which is fitted, says of all."""
+        first = self.kept(self.tiles[0])
+        assert first is not None
+        return SharedByTiles.by(self.problem(self.tiles[0]), first.step)
+
+    def problem(self, tile: Tile) -> Problem:
+        """What is to be fitted of a tile."""
+        shared = None if tile == self.tiles[0] else self.shared
+        return problem_of_tile(self.whole, self.layout, tile, self.noise, shared)
+
+    def volume(self, stopped: Sequence[tuple[Tile, Float[Tensor, "z row column"]]] = ()) -> Float[Tensor, "z y x"]:
+        """Δn of the field, of those tiles that are fitted, and of those that were stopped."""
+        fitted = ((tile, ended.step.delta) for tile, ended in self.ended())
+        return blended_volume(self.layout, self.whole.setup.field.shape[0], chain(fitted, stopped))
+
+    def images(self) -> Float[Tensor, "prism focus y x"]:
+        """The model's images of the field."""
+        found = ((tile, model_images(self.problem(tile), ended.step)) for tile, ended in self.ended())
+        return blended_images(self.layout, self.whole.setup.shape[:2], found)
+
+    def ended(self) -> Iterator[tuple[Tile, Checkpoint]]:
+        """The fitted tiles, one at a time."""
+        for tile in self.tiles:
+            found = self.kept(tile)
+            if found is None:
+                return  # those after it aren't fitted either
+            yield tile, found
+
+    def together(self) -> Tiled:
+        """What the fitted tiles say together."""
+        steps, seconds = {}, {}
+        for tile, ended in self.ended():
+            steps[str(tile)], seconds[str(tile)] = ended.step.number, ended.step.seconds
+        first = self.kept(self.tiles[0])
+        assert first is not None
+        delta = self.volume()
+        values = {**self.shared.values, IndexDifference.name: delta}
+        whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()))
+        ended = replace(first, step=whole)
+        axes = self.layout.along_y, self.layout.along_x
+        record = {
+            "pixels": [axis.size for axis in axes],
+            "overlap": [axis.overlap for axis in axes],
+            "margin": self.layout.margin,
+            "steps": steps,
+            "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        }
+        return Tiled(ended, self.images(), self.problem(self.tiles[0]), record)
+
+    def leave_so_far(self, tile: Tile, step: Step) -> str:
+        """Leave the volume of the fitted tiles and of one that is stopped at a step; returns words about it."""
+        number = f"{sum(1 for _ in self.ended())} of {len(self.tiles)} tiles"
+        delta = self.volume([(tile, step.delta.detach().cpu())])
+        path = leave_interrupted(self.out, delta, self.whole.setup.field, f"delta n, interrupted after {number}")
+        return f"{path.name} holds Δn so far: {number}, and this one as it is"

@@ -1,0 +1,74 @@
+"""The tiles of a run on disk: those that are fitted, so that an interrupted run goes on with the others."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+from recon.run.checkpoint import Checkpoint, CheckpointError, load, save
+from recon.run.recorded import CHECKPOINT
+from recon.tiling.layout import Layout, Tile
+from torchdic.files.whole import write_json
+
+TILES = "tiles"
+
+# A tile's last step, without what a descent would need to go on.
+FITTED = "fitted.pt"
+
+# What all tiles are.
+LAYOUT = "layout.json"
+
+
+def folder_of(out: Path, tile: Tile) -> Path:
+    """The folder of a tile's log and checkpoint."""
+    return out / TILES / str(tile)
+
+
+def identity_of(whole: str, layout: Layout, tile: Tile, steps: int, shared: str = "") -> str:
+    """What a tile's fit depends on. whole: of the field. shared: of what the first tile said."""
+    rows, columns = tile.rows.pixels, tile.columns.pixels
+    lines = [
+        f"tile = rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}, margin {layout.margin}",
+        f"reconstruction.steps = {steps}",  # a fitted tile can't go on
+        f"the first tile's fit = {shared or 'this one'}",
+    ]
+    return "\n".join([whole, *lines])
+
+
+def keep(folder: Path, ended: Checkpoint) -> None:
+    """Keep a fitted tile; its checkpoint, many times as large, goes. Raises WriteError."""
+    save(folder / FITTED, replace(ended, step=replace(ended.step, state={})))
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+
+
+def kept(folder: Path, identity: str) -> Checkpoint | None:
+    """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
+    return load(folder / FITTED, identity) if (folder / FITTED).exists() else None
+
+
+def begun(folder: Path, identity: str) -> Checkpoint | None:
+    """What a tile's interrupted descent goes on from; None begins it. Raises CheckpointError as `kept` does."""
+    return load(folder / CHECKPOINT, identity) if (folder / CHECKPOINT).exists() else None
+
+
+def remember_side(out: Path, side: int, memory: int) -> None:
+    """Leave what the tiles of a run are, for another one to go on. side: as given. memory: of a tile's images."""
+    (out / TILES).mkdir(exist_ok=True)
+    write_json(out / TILES / LAYOUT, {"side": side, "memory": memory})
+
+
+def remembered_side(out: Path) -> tuple[int, int] | None:
+    """What `remember_side` left; None where no tile has been begun. Raises CheckpointError where it can't be read."""
+    path = out / TILES / LAYOUT
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return int(found["side"]), int(found["memory"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path}: can't be read: {error}; begin anew with --restart") from error
+
+
+def forget(out: Path) -> None:
+    """Remove all tiles of a folder of results."""
+    shutil.rmtree(out / TILES, ignore_errors=True)

@@ -1,0 +1,169 @@
+"""The problem of one tile, and what all tiles share.
+
+A field that is fitted whole has one scale of its misfit, one weight of its priors, one contrast that they know, and one
+value of what is learned beside Δn. So have its tiles: the one whose images show most is fitted first, as any field is,
+and the others take from it what a specimen's contrast tells, and an empty tile would guess.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from recon.fit.bounds import SupportedBounds
+from recon.fit.newton.descent import known_contrast
+from recon.fit.nuisances.light import Lamp
+from recon.fit.problem import Problem
+from recon.fit.setup import Setup, empty_medium
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference, Unknown
+from recon.misfit.base import Misfit
+from recon.misfit.level import image_means
+from recon.prior.weight import FollowsNoise
+from recon.tiling.layout import Layout, Span, Tile
+
+
+@dataclass(frozen=True, eq=False)
+class SharedByTiles:
+    """What the first tile's fit says of all tiles.
+
+    misfit: whose scale is that of all. weight: of the priors, where it follows the noise. contrast: of the specimen.
+    values: of what was learned beside Δn, by name, but for the lamp: an uneven one is another one in each tile.
+    """
+
+    misfit: Misfit
+    weight: float | None
+    contrast: float
+    values: dict[str, Tensor]
+
+    @classmethod
+    def by(cls, problem: Problem, last: Step) -> "SharedByTiles":
+        """What a tile's finished fit says. problem: its own. last: its last step."""
+        weight = last.weights[-1]["tv"] if problem.weight is not None and last.weights else None
+        own = {u.name for u in problem.unknowns if _is_of_tile(u)}
+        values = {name: value for name, value in last.values.items() if name not in own}
+        return cls(problem.misfit, weight, known_contrast(last), values)
+
+
+def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:
+    """The tiles in the order in which they are fitted: the one whose images show most, then row by row."""
+    contrast = misfit.where_counted(misfit.data - image_means(misfit.data, misfit.mask)).square()
+    power = (contrast / misfit.variance).mean((0, 1))
+
+    def shown(tile: Tile) -> float:
+        return float(power[tile.rows.pixels, tile.columns.pixels].sum())
+
+    first = max(layout, key=shown)
+    return [first, *(tile for tile in layout if tile != first)]
+
+
+def without_margin(problem: Problem) -> Problem:
+    """The problem of a field alone: the tiles have their own margins."""
+    setup = problem.setup
+    if setup.margin == 0:
+        return problem
+
+    def within(unknown: Unknown) -> Unknown:
+        support = _support(unknown)
+        return unknown if support is None else _supported(unknown, setup.within_field(support))
+
+    medium = empty_medium(setup.field, float(setup.volume.background), setup.volume.delta)
+    unknowns = [within(unknown) for unknown in problem.unknowns]
+    return replace(problem, setup=replace(setup, volume=medium, margin=0), unknowns=unknowns)
+
+
+def lacks(whole: Problem, layout: Layout, tile: Tile) -> str | None:
+    """Why there is nothing to fit in a tile; None where there is. whole: without a margin."""
+    mask, support = whole.misfit.mask, whole.support
+    if mask is not None and not bool(mask[..., tile.rows.pixels, tile.columns.pixels].flatten(1).any(1).all()):
+        return "no pixel counts"
+    if support is not None and not bool(_with_margin(support, tile, layout.margin).any()):
+        return "no Δn is sought"
+    return None
+
+
+def problem_of_tile(
+    whole: Problem, layout: Layout, tile: Tile, noise: Sequence[float] | None, shared: SharedByTiles | None = None
+) -> Problem:
+    """What is to be fitted of a tile.
+
+    whole: the problem of the field, without a margin. noise: standard deviation of each prism's; None isn't known.
+    shared: by the first tile; None is that one itself.
+    Raises ValueError where the tile `lacks` what is to be fitted and for an uneven lamp that isn't learned, and
+    NotImplementedError for a misfit that has no parts.
+    """
+    if whole.setup.lamp is not None:
+        raise ValueError("an uneven lamp that is given can't be cut into tiles; learn it")
+    # given weights of the priors are relative to the scale of the whole
+    unit = whole.misfit if whole.weight is None else None if shared is None else shared.misfit
+    misfit = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
+    setup, unknowns = _setup(whole.setup, layout), [_in_tile(u, layout, tile) for u in whole.unknowns]
+    if shared is not None:
+        for unknown in unknowns:
+            if not _is_of_tile(unknown):
+                setup = unknown.put(shared.values[unknown.name].to(misfit.data.device), setup)
+        unknowns = [unknown for unknown in unknowns if _is_of_tile(unknown)]
+    tile_problem = replace(whole, setup=setup, misfit=misfit, unknowns=unknowns)
+    return replace(
+        tile_problem, weight=_weight(whole, tile_problem, noise, shared), contrast=shared and shared.contrast
+    )
+
+
+def _weight(whole: Problem, tile: Problem, noise: Sequence[float] | None, shared: SharedByTiles | None) -> FollowsNoise:
+    """The common factor of a tile's priors: found by the first tile, and held by the others.
+
+    Where the weights are given, they are those of the whole field without a margin.
+    """
+    misfit = tile.misfit
+    pixels = int(misfit.pixels.sum())
+    if whole.weight is None:
+        return FollowsNoise(None, pixels, tile.setup.dilution, held=True)
+    known = misfit.of_noise(noise) if misfit.knows_all and noise is not None else None
+    if shared is None:
+        return replace(whole.weight, noise_misfit=known, pixels=pixels)
+    return FollowsNoise(known, pixels, shared.weight, held=True)
+
+
+def _is_of_tile(unknown: Unknown) -> bool:
+    """Whether each tile has its own value of an unknown."""
+    return isinstance(unknown, IndexDifference | Lamp)
+
+
+def _setup(whole: Setup, layout: Layout) -> Setup:
+    """The setup of a tile; they are all alike."""
+    field = replace(whole.field, shape=(whole.field.shape[0], layout.along_y.count, layout.along_x.count))
+    medium = empty_medium(
+        field.widened(layout.margin, layout.margin), float(whole.volume.background), whole.volume.delta
+    )
+    return replace(whole, volume=medium, margin=layout.margin)
+
+
+def _support(unknown: Unknown) -> Bool[Tensor, "z y x"] | None:
+    """The voxels in which Δn is sought, if the unknown is Δn and they aren't all."""
+    bounds = unknown.bounds if isinstance(unknown, IndexDifference) else None
+    return bounds.support if isinstance(bounds, SupportedBounds) else None
+
+
+def _supported(unknown: Unknown, support: Bool[Tensor, "z y x"]) -> Unknown:
+    """Δn with another support."""
+    assert isinstance(unknown, IndexDifference)
+    return replace(unknown, bounds=SupportedBounds(unknown.bounds.lower, unknown.bounds.upper, support))
+
+
+def _in_tile(unknown: Unknown, layout: Layout, tile: Tile) -> Unknown:
+    """An unknown whose support, if it has one, is the tile's."""
+    support = _support(unknown)
+    return unknown if support is None else _supported(unknown, _with_margin(support, tile, layout.margin))
+
+
+def _with_margin(support: Bool[Tensor, "z y x"], tile: Tile, margin: int) -> Bool[Tensor, "z row column"]:
+    """A tile's part of a support, with its margin; beyond the field it goes on as at the edge."""
+
+    def indices(span: Span, voxels: int) -> Tensor:
+        wanted = torch.arange(span.voxels.start - margin, span.voxels.stop + margin, device=support.device)
+        return wanted.clamp(0, voxels - 1)
+
+    _, ny, nx = support.shape
+    return support[:, indices(tile.rows, ny)[:, None], indices(tile.columns, nx)]

@@ -1,0 +1,476 @@
+"""A field cut into tiles: they cover it, count as the whole does, and their fits together are the fit of the whole."""
+
+import json
+import math
+from collections import deque
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_reconstruct import command, content, interrupt_at, volume
+
+from recon.config.reading import load
+from recon.descend import Problem, Recipe, minimise
+from recon.fit.setup import Setup, empty_medium
+from recon.misfit.gaussian import GaussianMisfit
+from recon.misfit.poisson import PoissonMisfit
+from recon.misfit.robust import RobustMisfit
+from recon.recording.noise import NoiseModel
+from recon.run import recorded
+from recon.run.tiles import sizes
+from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
+from recon.tiling.blending import blended_images, blended_volume
+from recon.tiling.layout import ALIGNED, Axis, Layout
+from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first, without_margin
+from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, ShortOfMemoryError, Volume
+
+NOISE = 0.004
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+# --- layout ----------------------------------------------------------------------------------------------------------
+
+
+@given(
+    pixels=st.integers(1, 500),
+    ratio=st.sampled_from([1.0, 2.0, 0.5, 1.5, 1.37, 2.9]),
+    side=st.integers(90, 300),
+    overlap=st.integers(0, 15),
+)
+@settings(max_examples=60, deadline=None)
+def test_tiles_cover_a_field_and_their_weights_are_one_together(pixels, ratio, side, overlap):
+    voxels = math.ceil(pixels * ratio)
+    axis = Axis.cut(voxels, int(voxels / ratio + 1e-6), ratio, side, overlap)
+    for weights in (axis.weights_of_pixels(), axis.weights_of_voxels()):
+        assert torch.allclose(weights.sum(0), torch.ones(weights.shape[1], dtype=torch.float64))
+        assert float(weights.min()) >= 0
+    of_pixels = axis.weights_of_pixels()
+    for row, span in zip(of_pixels, axis.spans, strict=True):
+        outside = row.clone()
+        outside[span.pixels] = 0
+        assert float(outside.abs().max()) == 0  # a tile counts only where it has images
+        assert span.pixels.stop - span.pixels.start == axis.size
+        assert span.voxels.stop - span.voxels.start == axis.count
+    assert axis.spans[0].pixels.start == 0
+    assert axis.spans[-1].pixels.stop == axis.pixels
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 0.5, 1.5, 1.37])
+def test_a_tiles_voxels_lie_behind_its_pixels(ratio):
+    voxels = 600
+    axis = Axis.cut(voxels, int(voxels / ratio + 1e-6), ratio, 150, 10)
+    assert len(axis.spans) > 3
+    assert max(axis.away(span.pixels.start) for span in axis.spans) <= ALIGNED
+
+
+def test_a_tile_that_holds_the_field_is_the_field():
+    (span,) = Axis.cut(40, 40, 1.0, 64, 8).spans
+    assert (span.pixels, span.voxels) == (slice(0, 40), slice(0, 40))
+
+
+def layout_of(field, side, margin, overlap):
+    return Layout.of(field, field, side, margin, overlap)
+
+
+def test_the_parts_of_a_volume_make_the_volume_again():
+    field = Grid((3, 50, 71), (0.3, 0.1, 0.1))
+    layout = layout_of(field, 30, 4, 8)
+    whole = torch.randn(field.shape, generator=generator())
+    wide = torch.nn.functional.pad(whole, (4,) * 4)
+    parts = []
+    for tile in layout:
+        rows, columns = tile.rows.voxels, tile.columns.voxels
+        parts.append((tile, wide[:, rows.start : rows.stop + 8, columns.start : columns.stop + 8]))
+    assert torch.allclose(blended_volume(layout, 3, parts), whole, atol=1e-6)
+    images = 1 + torch.randn(2, 4, 50, 71, generator=generator(1))
+    cut = [(tile, images[..., tile.rows.pixels, tile.columns.pixels]) for tile in layout]
+    assert torch.allclose(blended_images(layout, (2, 4), cut), images, atol=1e-6)
+    assert torch.equal(blended_images(layout, (2, 4), []), torch.ones(2, 4, 50, 71))  # as an empty medium
+
+
+# --- misfit ----------------------------------------------------------------------------------------------------------
+
+
+def kinds(data, mask):
+    model = NoiseModel(torch.tensor([1e-4, 2e-4])[:, None, None, None], 1e-3)
+    return [
+        GaussianMisfit(data, None, mask),
+        GaussianMisfit(data, model, mask),
+        PoissonMisfit(data, model, mask),
+        RobustMisfit(data, torch.tensor([0.01, 0.02]), mask),
+    ]
+
+
+@pytest.mark.parametrize("kind", range(4))
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_misfit_is_the_mean_of_its_parts(kind, masked):
+    """Each part counts by its pixels; edges lose a neighbour, which a noise model sees."""
+    data = 1 + 0.05 * torch.randn(2, 3, 20, 16, dtype=torch.float64, generator=generator(2))
+    mask = torch.rand(data.shape, generator=generator(3)) > 0.2 if masked else None
+    images = 1 + 0.01 * torch.randn(data.shape, dtype=torch.float64, generator=generator(4))
+    whole = kinds(data, mask)[kind]
+    total = 0.0
+    for rows in (slice(0, 8), slice(8, 20)):
+        part = whole.part(rows, slice(None), whole)
+        if kind == 0:  # the prisms are averaged, each over its own pixels
+            weight = part.pixels / whole.pixels
+            squares = part.prism_means((part.counted(images[:, :, rows]) - part.data).square())
+            assert float(part(images[:, :, rows])) == pytest.approx(float((squares / part.variance.flatten()).mean()))
+            total += float((weight * squares / whole.variance.flatten()).mean())
+        else:
+            total += float(part(images[:, :, rows]) * part.pixels.sum() / whole.pixels.sum())
+    assert total == pytest.approx(float(whole(images)), rel=2e-2 if kind == 1 else 1e-12)
+
+
+def test_an_empty_part_has_a_misfit_in_the_units_of_another():
+    data = torch.ones(1, 2, 8, 16)
+    data[..., 8:] += 0.1 * torch.randn(1, 2, 8, 8, generator=generator(5))
+    whole = GaussianMisfit(data)
+    part = whole.part(slice(None), slice(0, 8), whole)
+    assert float(part(torch.ones(1, 2, 8, 8))) == 0
+    with pytest.raises(ValueError, match="uniform"):
+        whole.part(slice(None), slice(0, 8))
+    with pytest.raises(ValueError, match="no scale of the kind gaussian"):
+        RobustMisfit(data, torch.tensor([0.1]), None, whole)
+
+
+# --- problems --------------------------------------------------------------------------------------------------------
+
+FIELD = Grid((5, 24, 64), (0.4, 0.17, 0.17))
+MICROSCOPE = Microscope(0.546, Objective(0.9), Condenser(0.6))
+ACQUISITION = Acquisition([Prism((0.0, 0.24), 1.5), Prism((0.24, 0.0), -1.5)], focus=[-1.0, 0.0, 1.0])
+FIDELITY = Fidelity(sources=18)
+
+
+def scene():
+    """Δn of three balls, one of which lies on the cut between two tiles."""
+    z, y, x = (FIELD.coordinates(axis) for axis in range(3))
+    delta = torch.zeros(FIELD.shape)
+    for cy, cx, radius, contrast in ((0.2, -3.4, 0.8, 0.02), (-0.3, 0.1, 0.9, 0.015), (0.1, 3.2, 0.7, 0.02)):
+        distance = (z[:, None, None] ** 2 + (y[:, None] - cy) ** 2 + (x - cx) ** 2).sqrt()
+        delta = torch.maximum(delta, contrast * torch.sigmoid((radius - distance) / 0.06))
+    return delta
+
+
+@pytest.fixture(scope="module")
+def field():
+    """The problem of a whole field and its truth."""
+    truth = scene()
+    with torch.no_grad():
+        images = Setup(Volume(FIELD, truth, 1.33), MICROSCOPE, ACQUISITION).images(Fidelity(sources=32, order=2))
+    data = images + NOISE * torch.randn(images.shape, generator=generator(6))
+    setup = Setup(empty_medium(FIELD, 1.33, data), MICROSCOPE, ACQUISITION)
+    return Problem.from_recipe(data, setup, FIDELITY, Recipe(), GaussianMisfit, [NOISE] * 2), truth
+
+
+def solved(problem):
+    return deque(minimise(problem), maxlen=1).pop()
+
+
+def fitted(whole, layout):
+    """The volume of the field, from fits of its tiles."""
+    shared, found = None, []
+    for tile in strongest_first(layout, whole.misfit):
+        problem = problem_of_tile(whole, layout, tile, [NOISE] * 2, shared)
+        last = solved(problem)
+        shared = shared or SharedByTiles.by(problem, last)
+        found.append((tile, last.delta))
+    return blended_volume(layout, FIELD.shape[0], found)
+
+
+def distance(found, other):
+    return float((found - other).norm() / other.norm())
+
+
+@pytest.mark.slow
+def test_tiles_make_the_volume_that_the_whole_field_makes(field):
+    """The second ball is cut in two by the seam."""
+    whole, truth = field
+    last = solved(whole)
+    found = fitted(whole, layout_of(FIELD, 40, 5, 10))
+    assert distance(found, last.delta) < 0.03
+    assert distance(found, truth) < 1.1 * distance(last.delta, truth)
+
+
+def test_other_tiles_hold_what_the_first_has_found(field):
+    whole, _ = field
+    layout = layout_of(FIELD, 40, 5, 10)
+    first, second = strongest_first(layout, whole.misfit)
+    shared = SharedByTiles(whole.misfit, 70.0, 0.012, {"brightness": torch.full((2, 3), 1.02)})
+    problem = problem_of_tile(whole, layout, second, [NOISE] * 2, shared)
+    assert [unknown.name for unknown in problem.unknowns] == ["delta"]
+    assert problem.weight is not None
+    assert problem.weight.held
+    assert (problem.weight.first, problem.contrast) == (70.0, 0.012)
+    assert torch.equal(problem.setup.brightness, shared.values["brightness"])
+    assert torch.equal(problem.misfit.variance, whole.misfit.variance)
+    own = problem_of_tile(whole, layout, first, [NOISE] * 2)
+    assert own.contrast is None
+    assert len(own.unknowns) == len(whole.unknowns)
+    assert own.weight is not None
+    # the tile's own noise, in the unit of its own variance
+    assert own.weight.noise_misfit == pytest.approx(NOISE**2 / float(own.misfit.variance.mean()), rel=0.05)
+
+
+def test_given_weights_mean_in_a_tile_what_they_mean_in_the_whole(field):
+    """Per voxel: the misfit's slope and the priors' keep their ratio, though the tile has a margin."""
+    whole, truth = field
+    whole = Problem.from_recipe(
+        whole.misfit.data, whole.setup, FIDELITY, Recipe(tv=(20.0, 20.0), l1=3.0), GaussianMisfit, [NOISE] * 2
+    )
+    layout = layout_of(FIELD, 40, 5, 10)
+    tile = next(iter(layout))
+    part = problem_of_tile(whole, layout, tile, [NOISE] * 2)
+    assert part.weight is not None
+    sides = part.setup.volume.grid.shape
+    assert part.weight.first == pytest.approx(sides[1] * sides[2] / (24 * 40))
+    assert part.weight.held
+
+    def slopes(problem, delta):
+        """Of misfit and priors, by a voxel in the middle of the tile."""
+        delta = delta.clone().requires_grad_()
+        setup = problem.unknowns[0].put(delta, problem.setup)
+        factor = 1.0 if problem.weight is None else problem.weight.first
+        priors = sum(factor * prior.weight(0, 1) * prior(setup.volume) for prior in problem.priors)
+        values = problem.misfit(setup.images(FIDELITY)), priors
+        return [torch.autograd.grad(value, delta, retain_graph=True)[0] for value in values]
+
+    wide = torch.nn.functional.pad(truth, (5, 5, 5, 5))[:, :, : 40 + 10]
+    (misfit, priors), (own_misfit, own_priors) = slopes(whole, truth), slopes(part, wide)
+    here, there = (slice(None), slice(9, 15), slice(6, 14)), (slice(None), slice(14, 20), slice(11, 19))
+    ratio = float(own_priors[there].norm() / priors[here].norm())
+    assert float(own_misfit[there].norm() / misfit[here].norm()) == pytest.approx(ratio, rel=0.05)
+
+
+def test_a_support_is_cut_with_its_tile(field):
+    whole, _ = field
+    support = torch.zeros(FIELD.shape, dtype=torch.bool)
+    support[:, 6:18, :12] = True
+    whole = Problem.from_recipe(
+        whole.misfit.data, whole.setup, FIDELITY, Recipe(), GaussianMisfit, [NOISE] * 2, support
+    )
+    layout = layout_of(FIELD, 40, 5, 10)
+    left, right = layout
+    part = problem_of_tile(whole, layout, left, [NOISE] * 2)
+    assert part.support is not None
+    assert torch.equal(part.setup.within_field(part.support), support[..., :40])
+    assert lacks(whole, layout, left) is None
+    assert lacks(whole, layout, right) == "no Δn is sought"
+
+
+def test_a_tile_without_a_pixel_that_counts_is_left_out(field):
+    whole, _ = field
+    mask = torch.ones(whole.misfit.data.shape, dtype=torch.bool)
+    mask[..., 24:] = False
+    masked = Problem.from_recipe(
+        whole.misfit.data, whole.setup, FIDELITY, Recipe(), lambda data: GaussianMisfit(data, None, mask), [NOISE] * 2
+    )
+    layout = layout_of(FIELD, 40, 5, 10)
+    assert [lacks(masked, layout, tile) for tile in layout] == [None, "no pixel counts"]
+
+
+def test_a_field_with_a_margin_is_cut_without_it(field):
+    whole, _ = field
+    setup = Setup(empty_medium(FIELD.widened(6, 6), 1.33, whole.misfit.data), MICROSCOPE, ACQUISITION, margin=6)
+    support = torch.ones(FIELD.shape, dtype=torch.bool)
+    wide = Problem.from_recipe(whole.misfit.data, setup, FIDELITY, Recipe(), GaussianMisfit, [NOISE] * 2, support)
+    bare = without_margin(wide)
+    assert bare.setup.volume.grid == FIELD
+    assert bare.setup.margin == 0
+    assert bare.support is not None
+    assert bare.support.shape == FIELD.shape
+
+
+# --- runs ------------------------------------------------------------------------------------------------------------
+
+CONFIG = """
+[volume]
+shape = [3, 22, 40]
+spacing = [0.4, 0.2, 0.2]
+background = 1.4
+[microscope]
+wavelength = 0.546
+objective = { na = 0.8 }
+condenser = { na = 0.5 }
+camera = { photons = 20000 }
+[acquisition]
+focus = [-0.6, 0.6]
+prisms = [{ shear = [0.0, 0.24], bias = 1.5 }, { shear = [0.24, 0.0], bias = 1.5 }]
+[specimen]
+kind = "bead"
+radius = 0.7
+contrast = 0.03
+[data]
+path = "made/stack.ome.tif"
+[reconstruction]
+steps = 4
+tiles = 25
+[fidelity]
+sources = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """A folder with a configuration, its stack, and an uninterrupted run by tiles in `whole`."""
+    folder = tmp_path_factory.mktemp("tiles")
+    path = folder / "a.toml"
+    path.write_text(CONFIG, encoding="utf-8")
+    assert command("simulate", path, "--out", folder / "made")[0] == 0
+    assert command("reconstruct", path, "--out", folder / "whole")[0] == 0
+    return folder
+
+
+def test_a_run_by_tiles_leaves_what_any_run_leaves(workplace):
+    out = workplace / "whole"
+    assert set(content(out)) == {
+        "volume.ome.tif", "metrics.json", "config.resolved.toml", "images.ome.tif", "images.png", "sections.png",
+        "misfit.png", "README.txt",
+    }  # fmt: skip
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(metrics["tiles"]["steps"]) == {"1-1", "1-2"}
+    assert metrics["misfit"] < 0.5
+    assert volume(out).shape == (3, 22, 40)
+    assert load(out / "config.resolved.toml").reconstruction.tiles == 25
+
+
+@pytest.mark.parametrize("at", [("first", 3), pytest.param(("second", 2), marks=pytest.mark.slow)])
+def test_an_interrupted_run_by_tiles_goes_on_where_it_was(workplace, tmp_path, monkeypatch, at):
+    out, path = tmp_path / "out", workplace / "a.toml"
+    which, number = at
+    interrupt_in_tile(monkeypatch, 0 if which == "first" else 1, number)
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 130
+    assert f"interrupted after step {number - 1} of 4; go on with --resume; volume.ome.tif holds Δn so far: " in err
+    assert f"{0 if which == 'first' else 1} of 2 tiles, and this one as it is" in err
+    assert volume(out).shape == (3, 22, 40)
+    code, err = command("reconstruct", path, "--out", out)
+    assert code == 2
+    assert "an interrupted run; go on with --resume, or begin anew with --restart" in err
+    assert command("reconstruct", path, "--out", out, "--resume")[0] == 0
+    assert torch.equal(volume(out), volume(workplace / "whole"))
+
+
+def interrupt_in_tile(patch, tile, number):
+    """Make the next run stop with KeyboardInterrupt in one of its tiles, counted from 0, when it would take a step."""
+    original, begun = recorded.minimise, []
+
+    def minimise(*arguments):
+        begun.append(arguments)
+        if len(begun) == tile + 1:
+            interrupt_at(patch, number)
+            patched = recorded.minimise
+            patch.setattr(recorded, "minimise", original)
+            for step in original(*arguments):
+                if step.number == number:
+                    raise KeyboardInterrupt
+                yield step
+            assert patched is not None
+        else:
+            yield from original(*arguments)
+
+    patch.setattr(recorded, "minimise", minimise)
+
+
+def test_tiles_of_another_run_are_not_gone_on_with(workplace, tmp_path, monkeypatch):
+    out, other = tmp_path / "out", workplace / "other.toml"
+    interrupt_in_tile(monkeypatch, 1, 2)
+    assert command("reconstruct", workplace / "a.toml", "--out", out)[0] == 130
+    other.write_text(CONFIG.replace("steps = 4", "steps = 3"), encoding="utf-8")
+    code, err = command("reconstruct", other, "--out", out, "--resume")
+    assert code == 2
+    assert "belongs to another configuration or other data: reconstruction.steps was 4, is 3" in err
+    (out / "tiles" / "layout.json").write_text("{", encoding="utf-8")
+    code, err = command("reconstruct", workplace / "a.toml", "--out", out, "--resume")
+    assert code == 2
+    assert "layout.json: can't be read" in err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("tiles = 25", "tiles = 20"), "20 voxels are too few: light goes 4 voxels to the side"),
+        (("tiles = 25", "tiles = 0"), "tiles 0 must be at least 1 voxel; 'none' cuts nothing"),
+        (("tiles = 25", "tiles = 25\nmethod = 'linear'"), "'linear' solves the whole field at once"),
+    ],
+)
+def test_tiles_that_make_no_sense_are_refused(workplace, tmp_path, change, told):
+    path = workplace / "refused.toml"
+    path.write_text(CONFIG.replace(*change), encoding="utf-8")
+    code, err = command("reconstruct", path, "--out", tmp_path / "out")
+    assert code == 2
+    assert told in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_error_bars_say_that_a_fit_by_tiles_has_none(workplace):
+    code, err = command("error-bars", workplace / "whole")
+    assert code == 2
+    assert "was fitted by tiles" in err
+
+
+# --- sizes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def little_memory(monkeypatch):
+    """A function that sets the free memory, in which no whole field has room."""
+
+    def without_room(*_):
+        raise ShortOfMemoryError("no room")
+
+    def free(number):
+        monkeypatch.setattr(sizes, "free_bytes", lambda _: number)
+        # of 400 bytes a voxel
+        monkeypatch.setattr(
+            sizes, "held_beside_images", lambda problem, *_: 400 * problem.misfit.data[0, 0].numel() * 5
+        )
+        monkeypatch.setattr(sizes, "check_room_for_descent", without_room)
+
+    return free
+
+
+def configured(tmp_path, **changes):
+    path = tmp_path / "b.toml"
+    text = CONFIG.replace("tiles = 25", "\n".join(f"{key} = {value!r}" for key, value in changes.items()))
+    path.write_text(text, encoding="utf-8")
+    return load(path)
+
+
+def test_a_field_without_room_is_cut_into_tiles_as_large_as_the_memory(field, tmp_path, little_memory):
+    whole, _ = field
+    config = configured(tmp_path)
+    found = {}
+    for free in (12_000_000, 20_000_000):
+        little_memory(free)
+        cut = cut_of(config, whole, GaussianMisfit, tmp_path, None)
+        assert cut is not None
+        found[free] = cut.layout.side
+        assert cut.memory <= free // 4
+        assert cut.problem(whole).fidelity.fidelity.memory == cut.memory
+    assert least_side(margin_of_tiles(config)) <= found[12_000_000] < found[20_000_000]
+    with_budget = cut_of(config, whole, GaussianMisfit, tmp_path, 6_000_000)  # as half of the first
+    assert with_budget is not None
+    assert with_budget.layout.side == found[12_000_000]
+
+
+def test_without_room_for_the_smallest_tiles_a_field_is_refused(field, tmp_path, little_memory):
+    little_memory(1_000_000)
+    with pytest.raises(ShortOfMemoryError, match="Tiles of 24 voxels and 4 more on each side need at least"):
+        cut_of(configured(tmp_path), field[0], GaussianMisfit, tmp_path, None)
+
+
+def test_tiles_may_be_switched_off(field, tmp_path, little_memory):
+    config = configured(tmp_path, tiles="none")
+    little_memory(10**9)
+    with pytest.raises(ShortOfMemoryError, match="no room"):
+        cut_of(config, field[0], GaussianMisfit, tmp_path, None)
+
+
+def test_a_field_with_room_stays_whole(field, tmp_path):
+    assert cut_of(configured(tmp_path), field[0], GaussianMisfit, tmp_path, None) is None
+    assert cut_of(configured(tmp_path, tiles=64), field[0], GaussianMisfit, tmp_path, None) is None
