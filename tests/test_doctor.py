@@ -70,7 +70,7 @@ def test_a_missing_extra_is_told_with_its_command(capsys, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(installation, "find_spec", lambda name: None if name == "nd2" else found(name))
     _, out, _ = told(capsys)
-    assert "[bio]         missing, for ND2 and CZI: pip install 'torchdic[bio]'" in out
+    assert "[bio]         missing, for ND2, CZI and LIF: pip install 'torchdic[bio]'" in out
 
 
 def test_the_packages_are_those_that_the_project_asks_for():

@@ -74,7 +74,7 @@ def test_a_suffix_that_no_format_has_is_taken_for_tiff(tmp_path, name):
 
 
 def test_a_file_of_unknown_suffix_and_content_is_no_tiff(tmp_path):
-    path = tmp_path / "stack.lif"
+    path = tmp_path / "stack.vsi"
     path.write_bytes(b"\xda\xce\xbe\x0a and so on")
     with pytest.raises(StackError, match="is no TIFF: it starts with"):
         read_stack(path)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
+from torchdic.files.extras.leica import LIF
 from torchdic.files.extras.nikon import ND2
 from torchdic.files.extras.ome_zarr import OME_ZARR_4, OME_ZARR_5, is_zarr
 from torchdic.files.extras.zeiss import CZI
@@ -26,7 +27,7 @@ from torchdic.files.whole import WriteError, folder_written_whole, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
-FORMATS: list[Format] = [TIFF, PNG, ND2, CZI, OME_ZARR_5, OME_ZARR_4]
+FORMATS: list[Format] = [TIFF, PNG, ND2, CZI, LIF, OME_ZARR_5, OME_ZARR_4]
 
 # The first bytes of a JPEG, whatever its name. Reading one would take its blocks for specimen.
 _JPEG = b"\xff\xd8\xff"

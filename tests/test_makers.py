@@ -1,0 +1,161 @@
+"""Files of microscopes' makers: CZI as Zeiss's own package writes it, LIF and ND2 written byte by byte in makers.py."""
+
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from makers import lif_image, write_lif, write_nd2
+
+from recon.cli import main
+from recon.config import load
+from torchdic.errors import StackError, StackWarning
+from torchdic.files.gathered import gather
+from torchdic.files.stack import read_stack
+
+STEPS = {"Z": -0.3e-6, "Y": 0.12e-6, "X": 0.11e-6}  # Leica's z may run downward
+BITS = "<ComponentBitCount>12</ComponentBitCount>"
+LENS = """<Instrument><Objectives>
+<Objective Name="Plan-Apo"><LensNA>1.4</LensNA><Immersion>Oil</Immersion></Objective>
+</Objectives></Instrument>"""
+PACKAGES = {"czi": "pylibCZIrw", "lif": "liffile", "nd2": "nd2"}
+
+
+def counts(scenes=2, channels=2, planes=4, size=(6, 8)):
+    random = np.random.default_rng(0)
+    return random.integers(0, 4000, (scenes, channels, planes, *size)).astype(np.uint16)
+
+
+def write_czi(path, data, *, written=lambda place: True, kinds=(np.uint16, np.uint16)):
+    """written: whether a plane (scene, channel, z) is. kinds: of each channel's pixels."""
+    from pylibCZIrw import czi
+
+    with czi.create_czi(str(path)) as file:
+        for scene, channel, z in filter(written, np.ndindex(data.shape[:3])):
+            plane = data[scene, channel, z].astype(kinds[channel])
+            plane = plane if plane.ndim == 3 else plane[..., None]
+            file.write(plane, plane={"C": channel, "Z": z}, scene=scene, location=(100 * scene, 0))
+        file.write_metadata(
+            "stack", channel_names={0: "plus", 1: "minus"}, scale_x=0.11e-6, scale_y=0.12e-6, scale_z=0.3e-6
+        )
+    with czi.edit_czi(str(path)) as file, file.edit_session() as builder:
+        xml = builder.get_xml().replace("<Information>", f"<Information>{LENS}", 1)
+        builder.set_xml(xml.replace("<Image>", f"<Image>{BITS}", 1))
+        builder.commit()
+    return path
+
+
+def of_maker(folder, kind, data):
+    pytest.importorskip(PACKAGES[kind], reason="the extra [bio] isn't installed")
+    path = folder / f"stack.{kind}"
+    if kind == "czi":
+        return write_czi(path, data)
+    if kind == "lif":
+        return write_lif(path, *(lif_image(f"image {n}", scene, "CZYX", STEPS) for n, scene in enumerate(data)))
+    return write_nd2(path, data.swapaxes(1, 2))
+
+
+@pytest.mark.parametrize("kind", PACKAGES)
+def test_one_of_several_stacks_is_read_with_its_sizes_and_its_microscope(tmp_path, kind):
+    data = counts()
+    path = of_maker(tmp_path, kind, data)
+    with warnings.catch_warnings(action="error"):
+        found = gather([path], series=1)
+    stack, setup = found.stack, found.setup
+    np.testing.assert_array_equal(stack.data, data[1])
+    assert stack.data.dtype == np.uint16
+    assert stack.pixel_size == ((0.11, 0.11) if kind == "nd2" else (0.12, 0.11))
+    assert (stack.focus_step, stack.bits) == (0.3, 12)
+    assert stack.names == {"czi": ("plus", "minus"), "lif": (), "nd2": ("DIC 0", "DIC 1")}[kind]
+    assert (setup.na, setup.immersion) == {"czi": (1.4, 1.515), "lif": (1.4, 1.518), "nd2": (1.2, 1.333)}[kind]
+    assert setup.objective == {"czi": "Plan-Apo", "lif": "HC PL APO 63x/1.40 OIL", "nd2": "Plan Apo"}[kind]
+
+
+@pytest.mark.parametrize("kind", PACKAGES)
+def test_several_stacks_are_refused_with_what_takes_one(tmp_path, kind):
+    path = of_maker(tmp_path, kind, counts())
+    with pytest.raises(StackError, match=r"series = 0 … 1 in \[data\] takes one of"):
+        read_stack(path)
+    with pytest.raises(StackError, match="series 2 must be from 0 to 1: the file holds 2"):
+        read_stack(path, 2)
+
+
+@pytest.mark.parametrize("kind", PACKAGES)
+def test_the_only_stack_needs_no_number_and_new_writes_a_configuration_for_it(tmp_path, kind, capsys):
+    random = np.random.default_rng(0)
+    data = random.poisson(1000, (1, 1, 3, 32, 32)).astype(np.uint16)
+    path = of_maker(tmp_path, kind, data)
+    assert main(["new", str(path), "--out", str(tmp_path / "run.toml")]) == 0
+    config = load(tmp_path / "run.toml")
+    assert config.data is not None
+    assert config.data.files == (str(path),)
+    np.testing.assert_array_equal(read_stack(path).data, data[0])
+    assert "0.11" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", PACKAGES)
+def test_a_file_that_was_cut_off_is_refused_in_a_line(tmp_path, kind):
+    path = of_maker(tmp_path, kind, counts(scenes=1))
+    whole = path.read_bytes()
+    for part in (0.1, 0.5, 0.9):
+        path.write_bytes(whole[: int(part * len(whole))])
+        with pytest.raises(StackError, match=rf"stack\.{kind}: ") as caught:
+            read_stack(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("kind", "package"), PACKAGES.items())
+def test_a_missing_package_is_named_with_how_to_install_it(tmp_path, monkeypatch, kind, package):
+    for name in (package, f"{package}.czi"):
+        monkeypatch.setitem(sys.modules, name, None)
+    path = tmp_path / f"stack.{kind}"
+    path.write_bytes(b"bytes of a maker")
+    line = rf"read by the package {package}, which is missing: pip install 'torchdic\[bio\]'"
+    with pytest.raises(StackError, match=line):
+        gather([path])
+
+
+# --- what one format has alone ----------------------------------------------------------------------------------------
+
+
+def test_a_plane_that_a_czi_lacks_is_named(tmp_path):
+    pytest.importorskip("pylibCZIrw")
+    path = write_czi(tmp_path / "a.czi", counts(scenes=1), written=lambda place: place != (0, 1, 2))
+    with pytest.raises(StackError, match="its plane Z 2, C 1, counted from 0, is missing"):
+        read_stack(path)
+
+
+def test_channels_of_a_czi_with_unlike_pixels_are_refused(tmp_path):
+    pytest.importorskip("pylibCZIrw")
+    path = write_czi(tmp_path / "a.czi", counts(scenes=1), kinds=(np.uint16, np.uint8))
+    with pytest.raises(StackError, match=r"pixels of several kinds \(Gray16, Gray8\)"):
+        read_stack(path)
+
+
+def test_a_coloured_czi_is_refused(tmp_path):
+    pytest.importorskip("pylibCZIrw")
+    data = np.stack([counts(1, 1, 1)] * 3, -1)
+    path = write_czi(tmp_path / "a.czi", data)
+    with pytest.raises(StackError, match="is a colour image, 3 samples per pixel"):
+        read_stack(path)
+
+
+def test_time_in_a_lif_is_taken_as_the_focus(tmp_path):
+    pytest.importorskip("liffile")
+    path = write_lif(tmp_path / "a.lif", lif_image("a", counts()[0, 0], "TYX", STEPS))
+    with pytest.warns(StackWarning, match="axis of time"):
+        assert read_stack(path).data.shape == (1, 4, 6, 8)
+
+
+def test_tiles_of_a_lif_are_refused(tmp_path):
+    pytest.importorskip("liffile")
+    path = write_lif(tmp_path / "a.lif", lif_image("tiles", counts(1)[0], "MZYX", STEPS))
+    with pytest.raises(StackError, match=r"tiles has axes of M \(2\) beside T, Z, C, Y and X"):
+        read_stack(path)
+
+
+def test_an_nd2_that_was_never_calibrated_has_no_pixel_size(tmp_path):
+    pytest.importorskip("nd2")
+    path = write_nd2(tmp_path / "a.nd2", counts(1).swapaxes(1, 2), pixel=1.0, calibrated=False)
+    stack = read_stack(path)
+    assert (stack.pixel_size, stack.focus_step) == (None, 0.3)
