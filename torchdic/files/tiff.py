@@ -145,7 +145,9 @@ def _calibrated_scale(data: np.ndarray, calibrated: np.ndarray, bits: int | None
 def _write(path: Path, stack: Stack, compression: str | None) -> None:
     """Write an OME-TIFF whose C axis is the prism and whose Z axis is the focus."""
     dy, dx = stack.pixel_size or (None, None)
-    metadata: dict[str, object] = {"axes": "CZYX"}
+    # Fiji's Bio-Formats shows the image's name above each plane, and no channel's
+    named = stack.names[0] if len(stack.names) == 1 else Path(stack.source).name.partition(".")[0]
+    metadata: dict[str, object] = {"axes": "CZYX", "Name": named}
     for axis, length in zip("ZYX", (stack.focus_step, dy, dx), strict=True):
         if length is not None:
             metadata |= {f"PhysicalSize{axis}": float(length), f"PhysicalSize{axis}Unit": "µm"}

@@ -1,21 +1,22 @@
 """What a folder of results holds, as layers for a viewer: arrays (z, y, x), their places, names and colour limits."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Shaped
+from torch import Tensor
 
 from recon.cli.specimens import specimen_of, voxels
 from recon.config.reading import load
 from recon.config.resolved import RESOLVED
 from recon.config.schema import Config, ConfigError
-from recon.run.data import camera_pixels
+from torchdic import Grid
 from torchdic.files.format import Stack, shape_text
-from torchdic.files.stack import read_stack
+from torchdic.files.stack import read_stack, read_volume
 
 # Volumes of Δn by their files, as they are called beside each other; then their error bars, and images of one kind.
 TRUTH = "truth.ome.tif"
@@ -44,7 +45,7 @@ class Shown:
     """
 
     name: str
-    data: Float[np.ndarray, "z y x"]
+    data: Shaped[np.ndarray, "z y x"]
     spacing: tuple[float, float, float]
     first: tuple[float, float, float]
     limits: tuple[float, float]
@@ -91,20 +92,19 @@ def _config(folder: Path) -> Config | None:
 def _volumes(folder: Path, config: Config | None) -> Iterator[Shown]:
     """The true Δn, where it is known, and those that were found, which lie above it."""
     if (folder / TRUTH).exists():
-        yield _volume("Δn, true", read_stack(folder / TRUTH))
+        yield _volume("Δn, true", *read_volume(folder / TRUTH))
     elif config is not None and config.specimen is not None:
-        grid = config.volume.grid
-        truth = voxels(specimen_of(config, str(folder / RESOLVED)), grid, torch.device("cpu")).delta.detach().numpy()
-        yield _volume("Δn, true", Stack(truth[None], grid.spacing[1:], grid.spacing[0]))
+        specimen, grid = specimen_of(config, str(folder / RESOLVED)), config.volume.grid
+        yield _volume("Δn, true", voxels(specimen, grid, torch.device("cpu")).delta.detach(), grid)
     for file in reversed(VOLUMES):
         if (folder / file).exists():
-            yield _volume(VOLUMES[file], read_stack(folder / file))
+            yield _volume(VOLUMES[file], *read_volume(folder / file))
 
 
 def _bars(folder: Path) -> Iterator[Shown]:
     for file, name in BARS.items():
         if (folder / file).exists():
-            yield _volume(name, read_stack(folder / file))
+            yield _volume(name, *read_volume(folder / file))
 
 
 def _images(folder: Path, config: Config | None) -> Iterator[Shown]:
@@ -133,11 +133,10 @@ def _others(folder: Path, config: Config | None) -> Iterator[Shown]:
             yield _image(name, stack.data[0], stack, config, _between(stack.data))
 
 
-def _volume(name: str, stack: Stack) -> Shown:
+def _volume(name: str, values: Tensor, grid: Grid) -> Shown:
     """A volume, or what is one value for each of its voxels; the limits are its own."""
-    data = stack.data[0]
-    spacing = (stack.focus_step or 1.0, *(stack.pixel_size or (1.0, 1.0)))
-    return Shown(name, data, spacing, _centred(data.shape, spacing), (float(data.min()), float(data.max())), "gray")
+    limits = float(values.min()), float(values.max())
+    return Shown(name, values.numpy(), grid.spacing, _first(grid), limits, "gray")
 
 
 def _image(name: str, data: np.ndarray, stack: Stack, config: Config | None, limits: tuple[float, float]) -> Shown:
@@ -145,7 +144,6 @@ def _image(name: str, data: np.ndarray, stack: Stack, config: Config | None, lim
 
     Planes that fall are turned over; unequal steps are shown as equal ones, which the name says.
     """
-    pixel = stack.pixel_size or (None if config is None else camera_pixels(config).spacing[1:])
     focus = [] if config is None else [float(focus) for focus in config.acquisition.focus]
     step, low = stack.focus_step, None
     if len(focus) == len(data):
@@ -154,15 +152,15 @@ def _image(name: str, data: np.ndarray, stack: Stack, config: Config | None, lim
             step = (max(focus) - low) / (len(focus) - 1)
             data = data[np.argsort(focus, kind="stable")]
             name += "" if stack.focus_step else " (planes at unequal steps)"
-    spacing = (step or 1.0, *(pixel or (1.0, 1.0)))
-    z, y, x = _centred(data.shape, spacing)
+    spacing = (step or 1.0, *(stack.pixel_size or (1.0, 1.0)))
+    z, y, x = _first(Grid(data.shape, spacing))
     first = (z if low is None else low, y, x)
-    return Shown(name, data, spacing, first, limits, "gray", "µm" if pixel else "pixel")
+    return Shown(name, data, spacing, first, limits, "gray", "µm" if stack.pixel_size else "pixel")
 
 
-def _centred(shape: Sequence[int], spacing: Sequence[float]) -> tuple[float, float, float]:
-    """The centre of the first of voxels that lie about the origin."""
-    z, y, x = (-(count - 1) / 2 * step for count, step in zip(shape, spacing, strict=True))
+def _first(grid: Grid) -> tuple[float, float, float]:
+    """The centre of a grid's first voxel."""
+    z, y, x = (grid.centre(axis, 0) for axis in range(3))
     return z, y, x
 
 
