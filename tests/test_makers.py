@@ -1,4 +1,7 @@
-"""Files of microscopes' makers: CZI as Zeiss's own package writes it, LIF and ND2 written byte by byte in makers.py."""
+"""Files of microscopes' makers, and of Micro-Manager.
+
+CZI and NDTiff are written by their makers' own packages, LIF and ND2 byte by byte in makers.py.
+"""
 
 import sys
 import warnings
@@ -113,6 +116,41 @@ def test_a_missing_package_is_named_with_how_to_install_it(tmp_path, monkeypatch
     line = rf"read by the package {package}, which is missing: pip install 'torchdic\[bio\]'"
     with pytest.raises(StackError, match=line):
         gather([path])
+
+
+# --- Micro-Manager's NDTiff -------------------------------------------------------------------------------------------
+
+
+def ndtiff(folder, data, *, written=lambda place: True):
+    """The file of an NDTiff of data (channel, z, y, x)."""
+    ndstorage = pytest.importorskip("ndstorage", reason="ndstorage, Micro-Manager's own writer, isn't installed")
+    folder.mkdir()
+    said = {"PixelSize_um": 0.11, "z-step_um": 0.3}
+    file = ndstorage.NDTiffDataset(str(folder), name="stack", summary_metadata=said, writable=True)
+    for channel, z in filter(written, np.ndindex(data.shape[:2])):
+        axes = {"channel": ("plus", "minus")[channel], "z": z - 2}  # about the plane in focus
+        file.put_image(axes, data[channel, z], {"BitDepth": 12})
+    file.finish()
+    file.close()
+    return next(folder.glob("*/*.tif"))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # ndstorage leaves its files to the collector
+def test_an_ndtiff_is_read_from_its_folder_or_its_file(tmp_path):
+    data = counts()[0]
+    file = ndtiff(tmp_path / "acquired", data)
+    for path in (file, file.parent):
+        stack = gather([path]).stack
+        np.testing.assert_array_equal(stack.data, data)
+        assert (stack.pixel_size, stack.focus_step, stack.bits) == ((0.11, 0.11), 0.3, 12)
+        assert stack.names == ("plus", "minus")
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_plane_that_an_ndtiff_lacks_is_refused(tmp_path):
+    file = ndtiff(tmp_path / "acquired", counts()[0], written=lambda place: place != (1, 2))
+    with pytest.raises(StackError, match="1 of 8 planes that it lists are missing"):
+        read_stack(file)
 
 
 # --- what one format has alone ----------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from torchdic.files.arrangement.series import chosen_series, pages_one_by_one
 from torchdic.files.described import ome
 from torchdic.files.described.bits import stated_bits
 from torchdic.files.described.imagej import StraightLine, calibration, imagej_sizes
+from torchdic.files.described.ndtiff import ndtiff_channels
 from torchdic.files.described.setup import setup_in_tiff
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.full_scale import full_scale
@@ -76,6 +77,8 @@ def _described(tif: tifffile.TiffFile, path: Path, number: int) -> tuple[ome.Siz
         ome.find_planes(tif, root, path)
         ome.warn_of_guessed_axes(root, path)
         return *ome.sizes_and_names(root, path, number), ome.has_places(root)
+    if tif.is_ndtiff:
+        return (None, None, None), ndtiff_channels(path), False
     return imagej_sizes(tif, path) if tif.is_imagej else (None, None, None), (), False
 
 
