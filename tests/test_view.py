@@ -157,6 +157,9 @@ def test_what_cannot_be_viewed_is_one_line(tmp_path):
         layers_of(tmp_path / "volume.ome.tif")
     with pytest.raises(StackError, match=r"volume\.ome\.tif: is no TIFF"):
         layers_of(tmp_path)
+    write_stack(tmp_path / "images.ome.tif", values(3, 2, 10, 14))
+    with pytest.raises(ConfigError, match="holds 3 channels, no measured and modelled ones in turn"):
+        layers_of(tmp_path)
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from recon.cli.specimens import specimen_of, voxels
+from recon.cli.specimens import specimen_of
 from recon.config.reading import load
 from recon.config.resolved import RESOLVED
 from recon.config.schema import Config, ConfigError
@@ -94,8 +94,8 @@ def _volumes(folder: Path, config: Config | None) -> Iterator[Shown]:
     if (folder / TRUTH).exists():
         yield _volume("Δn, true", *read_volume(folder / TRUTH))
     elif config is not None and config.specimen is not None:
-        specimen, grid = specimen_of(config, str(folder / RESOLVED)), config.volume.grid
-        yield _volume("Δn, true", voxels(specimen, grid, torch.device("cpu")).delta.detach(), grid)
+        grid = config.volume.grid
+        yield _volume("Δn, true", specimen_of(config, str(folder / RESOLVED)).delta(grid, dtype=torch.float32), grid)
     for file in reversed(VOLUMES):
         if (folder / file).exists():
             yield _volume(VOLUMES[file], *read_volume(folder / file))
@@ -116,6 +116,8 @@ def _images(folder: Path, config: Config | None) -> Iterator[Shown]:
     if not (folder / IMAGES).exists():
         return
     stack = read_stack(folder / IMAGES)
+    if len(stack.data) % 2:
+        raise ConfigError(f"{stack.source}: holds {len(stack.data)} channels, no measured and modelled ones in turn")
     measured, modelled = stack.data[0::2], stack.data[1::2]
     residuals = measured - modelled
     largest = _between(np.abs(residuals))[1]
