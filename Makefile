@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-all stability lint bench clean
+.PHONY: demo test test-all test-view stability lint bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -25,6 +25,11 @@ test: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(PYTEST)
+
+# what make test leaves out where napari isn't installed
+test-view: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,view]"
+	$(BIN)/python -m pytest tests/test_view.py tests/test_makers.py
 
 stability: $(INSTALLED)
 	$(BIN)/python -m pytest --table tests/test_stability.py tests/test_properties.py

@@ -1,6 +1,5 @@
 """torchdic doctor: what an installation holds, and whether it computes what it should."""
 
-import importlib.util
 import re
 from pathlib import Path
 
@@ -67,10 +66,11 @@ def test_a_wrong_gradient_fails(monkeypatch):
 
 
 def test_a_missing_extra_is_told_with_its_command(capsys, monkeypatch):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(installation, "find_spec", lambda name: None if name == "nd2" else found(name))
+    found = installation._version
+    missing = installation.MISSING
+    monkeypatch.setattr(installation, "_version", lambda name: missing if name == "nd2" else found(name))
     _, out, _ = told(capsys)
-    assert "[bio]         missing, for ND2 and CZI: pip install 'torchdic[bio]'" in out
+    assert "[bio]         missing, for ND2, CZI and LIF: pip install 'torchdic[bio]'" in out
 
 
 def test_the_packages_are_those_that_the_project_asks_for():

@@ -242,7 +242,7 @@ def test_compare_leaves_every_volume_a_picture_and_the_numbers(tmp_path, capsys)
     known = Truth(GRID, truth, 1.5, inside=truth > 0)
     scores = compare(data, known, microscope, acquisition, contenders, tmp_path)
     assert [score.propagation for score in scores] == ["projection", "wave"]
-    names = {"projection.ome.tif", "wave.ome.tif", "comparison.png", "comparison.json"}
+    names = {"truth.ome.tif", "projection.ome.tif", "wave.ome.tif", "comparison.png", "comparison.json"}
     assert {p.name for p in tmp_path.iterdir()} == names
     for score in scores:
         delta, grid = read_volume(tmp_path / f"{score.propagation}.ome.tif")

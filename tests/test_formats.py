@@ -74,16 +74,17 @@ def test_a_suffix_that_no_format_has_is_taken_for_tiff(tmp_path, name):
 
 
 def test_a_file_of_unknown_suffix_and_content_is_no_tiff(tmp_path):
-    path = tmp_path / "stack.lif"
+    path = tmp_path / "stack.vsi"
     path.write_bytes(b"\xda\xce\xbe\x0a and so on")
     with pytest.raises(StackError, match="is no TIFF: it starts with"):
         read_stack(path)
 
 
-def test_a_grey_png_is_one_plane(tmp_path):
+@pytest.mark.parametrize(("dtype", "step"), [(np.uint8, 7), (np.uint16, 1000)])
+def test_a_grey_png_is_one_plane(tmp_path, dtype, step):
     import imagecodecs
 
-    grey = np.arange(35, dtype=np.uint16).reshape(5, 7) * 1000
+    grey = np.arange(35, dtype=dtype).reshape(5, 7) * dtype(step)
     for name, image in (("grey", grey), ("rgb", np.stack([grey] * 3, -1)), ("alpha", np.stack([grey] * 4, -1))):
         (tmp_path / f"{name}.png").write_bytes(imagecodecs.png_encode(image))
         assert np.array_equal(read_stack(tmp_path / f"{name}.png").data[0, 0], grey)

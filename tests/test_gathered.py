@@ -1,9 +1,6 @@
 """A stack in several files, and what files say of their microscope."""
 
-import sys
-from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -197,98 +194,3 @@ def test_ome_says_the_objective_that_was_used(tmp_path):
     tifffile.tiffcomment(path, xml.replace("<Channel ", '<Channel EmissionWavelength="546" ').encode())
     setup = gather([path]).setup
     assert (setup.na, setup.immersion, setup.objective, setup.wavelength) == (1.3, 1.46, "HC", pytest.approx(0.546))
-
-
-# --- files of makers --------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class StandInND2:
-    """As the package nd2 gives a file; the package itself is no dependency of the tests."""
-
-    path: Path
-
-    def __enter__(self):
-        channel = SimpleNamespace(
-            channel=SimpleNamespace(name="DIC", emissionLambdaNm=546.0),
-            microscope=SimpleNamespace(
-                objectiveNumericalAperture=1.2, immersionRefractiveIndex=1.333, objectiveName="Plan Apo"
-            ),
-        )
-        self.sizes = {"P": 2, "Z": 12, "Y": 5, "X": 6}
-        self.metadata = SimpleNamespace(channels=[channel])
-        self.attributes = SimpleNamespace(bitsPerComponentSignificant=12)
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-    def asarray(self):
-        return STACK
-
-    def voxel_size(self):
-        return SimpleNamespace(x=0.11, y=0.12, z=0.3)
-
-
-CZI_METADATA = """<ImageDocument><Metadata><Scaling><Items>
-<Distance Id="X"><Value>1.1e-7</Value></Distance><Distance Id="Y"><Value>1.2e-7</Value></Distance>
-<Distance Id="Z"><Value>3e-7</Value></Distance></Items></Scaling>
-<Information><Image><ComponentBitCount>12</ComponentBitCount></Image><Instrument><Objectives>
-<Objective Name="Plan-Apo"><LensNA>1.4</LensNA><Immersion>Oil</Immersion></Objective>
-</Objectives></Instrument></Information></Metadata></ImageDocument>"""
-
-
-@dataclass
-class StandInCZI:
-    """As the package czifile gives a file."""
-
-    path: Path
-
-    def __enter__(self):
-        self.scenes = {
-            number: SimpleNamespace(dims=("Z", "Y", "X"), asarray=lambda number=number: STACK[number])
-            for number in range(2)
-        }
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-    def metadata(self):
-        return CZI_METADATA
-
-
-def stand_in(monkeypatch, name, **classes):
-    module = ModuleType(name)
-    vars(module).update(classes)
-    monkeypatch.setitem(sys.modules, name, module)
-
-
-@pytest.mark.parametrize(
-    ("suffix", "name", "classes", "na"),
-    [("nd2", "nd2", {"ND2File": StandInND2}, 1.2), ("czi", "czifile", {"CziFile": StandInCZI}, 1.4)],
-)
-def test_a_makers_file_is_read_by_its_package(tmp_path, monkeypatch, suffix, name, classes, na):
-    stand_in(monkeypatch, name, **classes)
-    path = tmp_path / f"stack.{suffix}"
-    path.write_bytes(b"bytes of a maker")
-    gathered = gather([path], series=1)
-    assert np.array_equal(gathered.stack.data, STACK[1:])
-    assert gathered.stack.pixel_size == pytest.approx((0.12, 0.11))
-    assert (gathered.stack.focus_step, gathered.stack.bits) == (pytest.approx(0.3), 12)
-    assert gathered.setup.na == na
-    with pytest.raises(StackError, match="series 2 must be from 0 to 1"):
-        gather([path], series=2)
-    with pytest.raises(StackError, match=r"more dimensions|holds 2 scenes"):
-        gather([path])
-
-
-@pytest.mark.parametrize(("suffix", "name"), [("nd2", "nd2"), ("czi", "czifile")])
-def test_a_missing_package_is_named_with_how_to_install_it(tmp_path, monkeypatch, suffix, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    path = tmp_path / f"stack.{suffix}"
-    path.write_bytes(b"bytes of a maker")
-    with pytest.raises(
-        StackError, match=rf"read by the package {name}, which is missing: pip install 'torchdic\[bio\]'"
-    ):
-        gather([path])

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -87,6 +88,26 @@ def test_what_is_written_is_what_the_specification_asks_for(tmp_path, suffix, ve
     assert image.name == "Δn"
     assert [axis.unit for axis in image.axes] == [None, *["micrometer"] * 3]
     assert image.datasets[0].coordinateTransformations[0].scale == [1.0, *GRID.spacing]
+    write_stack(tmp_path / f"stack{suffix}", counts(2, 3, 5, 7), names=("plus", "minus"))  # without sizes
+    found = models.Image.from_zarr(zarr.open_group(str(tmp_path / f"stack{suffix}"), mode="r")).attributes
+    said = found if version == "v04" else found.ome
+    assert [axis.unit for axis in said.multiscales[0].axes] == [None] * 4
+
+
+@SUFFIXES
+@pytest.mark.parametrize("compression", [None, "zlib"])
+def test_a_volume_in_a_file_is_written_without_being_held_in_memory(tmp_path, suffix, compression):
+    grid, random = Grid((48, 128, 128), (0.5, 0.2, 0.1)), np.random.default_rng(0)
+    delta = np.memmap(tmp_path / "delta.raw", np.float32, "w+", shape=grid.shape)
+    for plane in delta:
+        plane[:] = random.random(plane.shape)
+    write_volume(tmp_path / f"small{suffix}", torch.zeros(GRID.shape), GRID)  # what is loaded at first doesn't count
+    tracemalloc.start()
+    write_volume(tmp_path / f"volume{suffix}", delta, grid, compression=compression)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < delta.nbytes / 2
+    np.testing.assert_array_equal(read_volume(tmp_path / f"volume{suffix}")[0], delta)
 
 
 def test_another_writers_image_is_read(tmp_path):

@@ -280,6 +280,7 @@ def test_ome_xml_is_what_its_schema_asks_for(tmp_path, kind):
         write_volume(path, PLANES / 1e5, Grid(PLANES.shape, (0.5, 0.2, 0.1)))
     with tifffile.TiffFile(path) as tif:
         (found,) = ome_types.from_xml(tif.ome_metadata, validate=True).images
+    assert found.name == ("written" if kind == "stack" else "delta n")
     pixels = found.pixels
     assert (pixels.size_c, pixels.size_z, pixels.size_y, pixels.size_x) == (2 if kind == "stack" else 1, *PLANES.shape)
     assert [getattr(pixels, f"physical_size_{axis}") for axis in "zyx"] == pytest.approx([0.5, 0.2, 0.1])

@@ -221,7 +221,7 @@ def test_a_renamed_file_keeps_the_order_that_its_xml_gives(tmp_path):
 def test_a_renamed_file_without_some_of_its_planes_is_refused(tmp_path):
     path = tmp_path / "renamed.ome.tif"
     ome_with(path, "".join(plane(i, "first.ome.tif", ifd=i + 2) for i in range(5)))
-    assert "planes that its OME-XML lists are missing" in the_error(path)
+    assert "planes that it lists are missing" in the_error(path)
 
 
 def test_a_set_of_files_names_the_one_that_is_missing_and_is_read_where_none_is(tmp_path):

@@ -116,6 +116,13 @@ COMMANDS = {
         (arguments.device, arguments.restart),
         own=True,
     ),
+    "view": Command(
+        "recon.cli.view.command",
+        "show volumes, error bars and images of a folder of results in napari",
+        "view run_volume",
+        (),
+        own=True,
+    ),
     "work-precision": Command(
         "recon.cli.accuracy.work_precision",
         "measure what accuracy costs: the error of images, or of reconstructions, against seconds and memory",

@@ -60,7 +60,9 @@ def compare(
     contenders: Sequence[tuple[Fidelity, Recipe]],
     out: Path,
 ) -> list[Score]:
-    """Reconstruct a stack by each contender; leaves each volume, comparison.png and comparison.json in a folder.
+    """Reconstruct a stack by each contender; leaves the volumes, comparison.png and comparison.json in a folder.
+
+    The true volume is among them.
 
     data: the stack, relative to the empty bright field.
     truth: the specimen that the stack shows.
@@ -88,6 +90,7 @@ def _score(propagation: str, last: Step, truth: Truth) -> Score:
 
 def _write(volumes: Mapping[str, Tensor], scores: Sequence[Score], grid: Grid, out: Path) -> None:
     figures.save(figures.draw_sections(volumes, grid, ("xy", "xz")), out / "comparison.png")
+    write_volume(out / "truth.ome.tif", volumes["truth"], grid, name="delta n, true")
     write_json(out / "comparison.json", [asdict(score) for score in scores])
 
 

@@ -174,7 +174,8 @@ def write_results(
 
     def write_sections() -> None:
         if sections is not None:
-            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], equal_step(measured.focus))
+            step, name = equal_step(measured.focus), "optical path length in µm"
+            write_stack(out / "opl.ome.tif", sections[None].cpu(), grid.spacing[1:], step, names=[name])
 
     def draw_images() -> None:
         figure = figures.draw_images(data, images.cpu(), prisms, measured.focus, problem.setup.pixels)

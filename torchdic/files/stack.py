@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.errors import StackError, StackWarning
+from torchdic.files.extras.leica import LIF
 from torchdic.files.extras.nikon import ND2
 from torchdic.files.extras.ome_zarr import OME_ZARR_4, OME_ZARR_5, is_zarr
 from torchdic.files.extras.zeiss import CZI
@@ -26,7 +27,7 @@ from torchdic.files.whole import WriteError, folder_written_whole, written_whole
 from torchdic.grid import Grid
 
 # The first format that has a file's suffix is used, and TIFF for a file whose suffix none of them has.
-FORMATS: list[Format] = [TIFF, PNG, ND2, CZI, OME_ZARR_5, OME_ZARR_4]
+FORMATS: list[Format] = [TIFF, PNG, ND2, CZI, LIF, OME_ZARR_5, OME_ZARR_4]
 
 # The first bytes of a JPEG, whatever its name. Reading one would take its blocks for specimen.
 _JPEG = b"\xff\xd8\xff"
@@ -143,7 +144,8 @@ def write_volume(
     """Write a volume in float32, as OME-TIFF unless the suffix of `path` names another format.
 
     path: the file to write or replace. An error leaves no half a file.
-    delta: (z, y, x), real.
+    delta: (z, y, x), real. One in float32 that lies in a file (numpy.memmap) is written as OME-Zarr plane by plane, and
+        never held whole in memory.
     grid: of delta's shape; its spacing becomes the voxel size in µm.
     name: of the file's one channel.
     compression: None stores the voxels as they are.
@@ -157,7 +159,7 @@ def write_volume(
         raise StackError(f"{path}: the volume has {shape_text(array.shape)} voxels, its grid {shape_text(grid.shape)}")
     if array.dtype.kind not in "iuf":
         raise StackError(f"{path}: voxels are {array.dtype}, a volume holds real numbers")
-    voxels = array[None].astype(np.float32)
+    voxels = array[None].astype(np.float32, copy=False)
     _write(path, Stack(voxels, grid.spacing[1:], grid.spacing[0], names=(name,), source=str(path)), compression)
 
 
@@ -223,7 +225,9 @@ def _check_writable(path: Path, stack: Stack, dtypes: tuple[str, ...]) -> None:
 def _check_finite(data: np.ndarray, path: Path) -> None:
     if data.dtype.kind != "f":
         return
-    bad = data.size - int(np.isfinite(data).sum())
+    bad = nan = 0
+    for plane in data.reshape(-1, *data.shape[-2:]):  # data may lie in a file, and be larger than memory
+        bad += plane.size - int(np.isfinite(plane).sum())
+        nan += int(np.isnan(plane).sum())
     if bad:
-        nan = int(np.isnan(data).sum())
         raise StackError(f"{path}: {bad} of {data.size} pixels are not finite ({nan} NaN, {bad - nan} infinite)")

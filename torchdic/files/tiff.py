@@ -16,6 +16,7 @@ from torchdic.files.arrangement.series import chosen_series, pages_one_by_one
 from torchdic.files.described import ome
 from torchdic.files.described.bits import stated_bits
 from torchdic.files.described.imagej import StraightLine, calibration, imagej_sizes
+from torchdic.files.described.ndtiff import ndtiff_channels
 from torchdic.files.described.setup import setup_in_tiff
 from torchdic.files.format import Format, Stack, shape_text
 from torchdic.files.full_scale import full_scale
@@ -76,6 +77,8 @@ def _described(tif: tifffile.TiffFile, path: Path, number: int) -> tuple[ome.Siz
         ome.find_planes(tif, root, path)
         ome.warn_of_guessed_axes(root, path)
         return *ome.sizes_and_names(root, path, number), ome.has_places(root)
+    if tif.is_ndtiff:
+        return (None, None, None), ndtiff_channels(path), False
     return imagej_sizes(tif, path) if tif.is_imagej else (None, None, None), (), False
 
 
@@ -145,7 +148,9 @@ def _calibrated_scale(data: np.ndarray, calibrated: np.ndarray, bits: int | None
 def _write(path: Path, stack: Stack, compression: str | None) -> None:
     """Write an OME-TIFF whose C axis is the prism and whose Z axis is the focus."""
     dy, dx = stack.pixel_size or (None, None)
-    metadata: dict[str, object] = {"axes": "CZYX"}
+    # Fiji's Bio-Formats shows the image's name above each plane, and no channel's
+    named = stack.names[0] if len(stack.names) == 1 else Path(stack.source).name.partition(".")[0]
+    metadata: dict[str, object] = {"axes": "CZYX", "Name": named}
     for axis, length in zip("ZYX", (stack.focus_step, dy, dx), strict=True):
         if length is not None:
             metadata |= {f"PhysicalSize{axis}": float(length), f"PhysicalSize{axis}Unit": "µm"}

@@ -112,7 +112,7 @@ def _check_planes(tif: tifffile.TiffFile, series: tifffile.TiffPageSeries, path:
     """Raise StackError where a plane of a series is missing, or lies in another file that ends before it."""
     missing = sum(page is None for page in series)
     if missing:
-        raise StackError(f"{path}: {missing} of {len(series)} planes that its OME-XML lists are missing")
+        raise StackError(f"{path}: {missing} of {len(series)} planes that it lists are missing")
     for page in series:
         if page is not None and page.parent is not tif:
             size = page.parent.filehandle.size

@@ -6,7 +6,6 @@ import re
 import shutil
 from collections.abc import Iterator
 from importlib import metadata
-from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -17,7 +16,9 @@ from torchdic import __version__
 from torchdic.memory.free import GIB, free_bytes
 
 # What each extra of the user's is for.
-EXTRAS = {"zarr": "OME-Zarr", "bio": "ND2 and CZI"}
+EXTRAS = {"zarr": "OME-Zarr", "bio": "ND2, CZI and LIF", "view": "torchdic view, and napari at the right scale"}
+
+MISSING = "missing"
 
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9_.-]+)(?P<rest>[^;]*)(?:;\s*extra\s*==\s*['\"](?P<extra>\w+)['\"])?")
 
@@ -32,7 +33,7 @@ def lines(device: torch.device, folder: Path) -> Iterator[tuple[str, str]]:
     if free is not None:
         yield "memory", f"{free / GIB:.1f} GiB{f' of {whole / GIB:.1f}' if whole else ''} free on {device}"
     for extra, what in EXTRAS.items():
-        missing = [name for name, _ in packages(extra) if find_spec(name) is None]
+        missing = [name for name, _ in packages(extra) if _version(name) == MISSING]
         way = f"missing, for {what}: pip install 'torchdic[{extra}]'" if missing else f"installed: {what}"
         yield f"[{extra}]", way
     try:
@@ -54,7 +55,7 @@ def _version(name: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
-        return "missing"
+        return MISSING
 
 
 def _devices() -> str:

@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
     phase = phase_of_image(torch.from_numpy(flat[plane]), direction.vector, noise_level(flat[plane]), aspect).numpy()
     phase = phase if phase.mean() >= 0 else -phase  # either sign explains the image
     prepare_folder(options.out)
-    write_stack(options.out / PHASE, phase.astype(np.float32), stack.pixel_size)
+    write_stack(options.out / PHASE, phase.astype(np.float32), stack.pixel_size, names=["phase, on an arbitrary scale"])
     facts = _facts(stack.source, (options.setting, plane + 1, planes), direction, options.shear_angle)
     write_json(options.out / FACTS, {**facts, "pixels": [ny, nx], "pixel_size": stack.pixel_size})
     image = stack.data[setting, plane]

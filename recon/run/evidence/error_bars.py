@@ -130,8 +130,8 @@ def _kept(kept: KeptRefits, estimate: Estimate, kind: Kind, number: int) -> Refi
 def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted: Wanted, seconds: float) -> None:
     """Write the volumes, the figure and the numbers into the reconstruction's folder."""
     out = done.out
-    write_volume(out / DEVIATION, found.deviation, found.grid)
-    write_volume(out / TOTAL, found.total, found.grid)
+    write_volume(out / DEVIATION, found.deviation, found.grid, name="standard deviation of delta n, by noise")
+    write_volume(out / TOTAL, found.total, found.grid, name="standard deviation of delta n, in all")
     figures.save(draw_error_bars(found.delta, found.deviation, found.total, found.grid), out / "error_bars.png")
     numbers = {
         "refits": {"noise": wanted.noise, "turned": wanted.copies, "seconds": round(seconds, 3)},

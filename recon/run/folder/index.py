@@ -9,7 +9,7 @@ INDEX = "README.txt"
 
 # What each file is, by its name, in the order in which one looks at them.
 FILES = {
-    "volume.ome.tif": "Δn (z, y, x), the index above the medium's; opens in Fiji and napari at its scale in µm",
+    "volume.ome.tif": "Δn (z, y, x), the index above the medium's, at its scale in µm: see it by torchdic view",
     "sections.png": "sections through the volume along z, y and x",
     "images.png": "measured and modelled images, and what the model leaves of them",
     "images.ome.tif": "every plane as it was measured and as the model has it, two channels for each prism",
@@ -37,6 +37,7 @@ FILES = {
     "phase.json": "the shear's axis and how it was found",
     "comparison.png": "the volumes of several methods beside the truth",
     "comparison.json": "their errors and seconds",
+    "truth.ome.tif": "Δn as it is",
     "projection.ome.tif": "Δn by straight rays",
     "rays.ome.tif": "Δn by bent rays",
     "wave.ome.tif": "Δn by the wave",

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import arrange, place_axis
 from torchdic.files.described.setup import StatedSetup
-from torchdic.files.extras.package import package
+from torchdic.files.extras.package import chosen, package
 from torchdic.files.format import Format, Stack
 
 
@@ -22,19 +21,17 @@ def _read_series(path: Path, number: int | None = None) -> Stack:
         data, axes = np.asarray(file.asarray()), "".join(file.sizes)
         along = place_axis(data.shape, axes)
         if number is not None:
-            held = 1 if along is None else data.shape[along]
-            if not 0 <= number < held:
-                raise StackError(f"{path}: series {number} must be from 0 to {held - 1}: the file holds {held}")
+            place = chosen(range(1 if along is None else data.shape[along]), number, path, "positions")
             if along is not None:
-                data, axes = data.take(number, along), axes[:along] + axes[along + 1 :]
-        voxel, setup = file.voxel_size(), _setup(file)
+                data, axes = data.take(place, along), axes[:along] + axes[along + 1 :]
+        setup, sizes = _setup(file), _sizes(file)
         names = tuple(str(channel.channel.name) for channel in _channels(file))
     data = np.ascontiguousarray(arrange(data, axes, path))
-    known = voxel.x > 0 and voxel.y > 0
+    (x, y, z), planes = sizes, data.shape[1]
     return Stack(
         data,
-        pixel_size=(float(voxel.y), float(voxel.x)) if known else None,
-        focus_step=float(voxel.z) if data.shape[1] > 1 and voxel.z > 0 else None,
+        pixel_size=None if x is None or y is None else (y, x),
+        focus_step=z if planes > 1 else None,
         bits=setup.bits,
         names=names if len(names) == len(data) else (),
         source=str(path),
@@ -45,6 +42,16 @@ def setup_in_nd2(path: Path) -> StatedSetup:
     """What an ND2 file says of its microscope."""
     with package("nd2", path).ND2File(path) as file:
         return _setup(file)
+
+
+def _sizes(file: Any) -> list[float | None]:
+    """The size of a voxel along x, y and z in µm, where the file was calibrated: it says 1 where it wasn't."""
+    channels = _channels(file)
+    if not channels:
+        return [None, None, None]
+    volume = channels[0].volume
+    pairs = zip(volume.axesCalibration, volume.axesCalibrated, strict=True)
+    return [float(size) if calibrated and size > 0 else None for size, calibrated in pairs]
 
 
 def _channels(file: Any) -> list[Any]:

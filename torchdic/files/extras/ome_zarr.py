@@ -14,7 +14,7 @@ import numpy as np
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import arrange
 from torchdic.files.described.units import micrometres
-from torchdic.files.extras.package import package
+from torchdic.files.extras.package import chosen, package
 from torchdic.files.format import Format, Stack
 
 Version = Literal["0.4", "0.5"]
@@ -75,14 +75,7 @@ def _image(path: Path, number: int | None) -> Any:
         images = [group[str(n)] for n in numbers if "multiscales" in _said(group[str(n)])]
     if not images:
         raise StackError(f"{path}: holds no image of OME-Zarr (its attributes name no multiscales)")
-    if number is None:
-        if len(images) > 1:
-            offer = f"series = 0 … {len(images) - 1} in [data] takes one of them"
-            raise StackError(f"{path}: holds {len(images)} images; a stack is one: {offer}")
-        return images[0]
-    if not 0 <= number < len(images):
-        raise StackError(f"{path}: series {number} must be from 0 to {len(images) - 1}: the file holds {len(images)}")
-    return images[number]
+    return chosen(images, number, path, "images")
 
 
 def _said(group: Any) -> Mapping[str, Any]:

@@ -1,10 +1,14 @@
 """The packages of extras, loaded where a file asks for one."""
 
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import TypeVar
 
 from torchdic.errors import StackError
+
+T = TypeVar("T")
 
 
 def package(name: str, path: Path, extra: str = "bio") -> ModuleType:
@@ -15,7 +19,23 @@ def package(name: str, path: Path, extra: str = "bio") -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
+        kind, distribution = path.suffix.lower()[1:].upper(), name.partition(".")[0]
         raise StackError(
-            f"{path}: {path.suffix.lower()[1:].upper()} files are read by the package {name}, which is missing: "
+            f"{path}: {kind} files are read by the package {distribution}, which is missing: "
             f"pip install 'torchdic[{extra}]', or save the stack as OME-TIFF"
         ) from error
+
+
+def chosen(held: Sequence[T], number: int | None, path: Path, kind: str) -> T:
+    """Which of the stacks that a file holds is read.
+
+    number: of it, counted from 0; None where the file has only one. kind: what the file calls its stacks.
+    Raises StackError where there is none of that number, or more than one and none is chosen.
+    """
+    last = len(held) - 1
+    if number is None and last > 0:
+        offer = f"series = 0 … {last} in [data] takes one of them"
+        raise StackError(f"{path}: holds {len(held)} {kind}; a stack is one: {offer}")
+    if not 0 <= (number or 0) <= last:
+        raise StackError(f"{path}: series {number} must be from 0 to {last}: the file holds {len(held)}")
+    return held[number or 0]

@@ -1,6 +1,8 @@
-"""Zeiss's CZI, read by the package czifile."""
+"""Zeiss's CZI, read by Zeiss's own package pylibCZIrw."""
 
+from itertools import product
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from xml.etree import ElementTree
 
@@ -9,10 +11,13 @@ import numpy as np
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import arrange
 from torchdic.files.described.setup import IMMERSIONS, StatedSetup
-from torchdic.files.extras.package import package
+from torchdic.files.extras.package import chosen, package
 from torchdic.files.format import Format, Stack
 
 _METRE = 1e6  # CZI's scalings are in metres
+
+# CZI's other axes are phases, views and the like, which no letter of tifffile's stands for.
+_NO_LETTER = "U"
 
 
 def _read(path: Path) -> Stack:
@@ -21,37 +26,72 @@ def _read(path: Path) -> Stack:
 
 def _read_series(path: Path, number: int | None = None) -> Stack:
     """One scene of a file; number: which, counted from 0, None for the only one."""
-    with package("czifile", path).CziFile(path) as file:
-        held = len(file.scenes)
-        if number is None and held > 1:
-            raise StackError(
-                f"{path}: holds {held} scenes; a stack is one: series = 0 … {held - 1} in [data] takes one"
-            )
-        if not 0 <= (number or 0) < held:
-            raise StackError(f"{path}: series {number} must be from 0 to {held - 1}: the file holds {held}")
-        scene = list(file.scenes.values())[number or 0]
-        data, axes = np.asarray(scene.asarray()), "".join(scene.dims)
-        root = ElementTree.fromstring(file.metadata())
+    with _czi(path).open_czi(str(path)) as file:
+        scenes = file.scenes_bounding_rectangle_no_pyramid
+        which = chosen(sorted(scenes) or [None], number, path, "scenes")
+        root = ElementTree.fromstring(file.raw_metadata)
+        data, axes = _planes(file, which, path)
     data = np.ascontiguousarray(arrange(data, axes, path))
     z, y, x = (_scaling(root, axis) for axis in "ZYX")
+    channels = root.findall(".//Information/Image/Dimensions/Channels/Channel")
+    names = tuple(channel.get("Name", "") for channel in channels)
     return Stack(
         data,
         pixel_size=(y, x) if y and x else None,
         focus_step=z if data.shape[1] > 1 else None,
         bits=_setup(root).bits,
+        names=names if len(names) == len(data) and all(names) else (),
         source=str(path),
     )
 
 
+def _planes(file: Any, scene: int | None, path: Path) -> tuple[np.ndarray, str]:
+    """All planes of a scene, each stitched from its tiles, and the letters of their axes.
+
+    Raises StackError where channels differ in their pixels, and where a plane was never written.
+    """
+    counts = {axis: end for axis, (_, end) in file.total_bounding_box_no_pyramid.items() if axis not in "XY"}
+    kinds = sorted(set(file.pixel_types.values()))
+    if len(kinds) > 1:
+        raise StackError(f"{path}: its channels have pixels of several kinds ({', '.join(kinds)}); a stack has one")
+    everywhere, scenes = file.total_bounding_rectangle_no_pyramid, file.scenes_bounding_rectangle_no_pyramid
+    rectangle = everywhere if scene is None else scenes[scene]
+    planes = []
+    for place in product(*map(range, counts.values())):
+        plane = {axis: index for axis, index in zip(counts, place, strict=True) if counts[axis] > 1}
+        if not _is_there(file, plane, rectangle):
+            where = ", ".join(f"{axis} {index}" for axis, index in plane.items())
+            raise StackError(f"{path}: its plane {where}, counted from 0, is missing")
+        planes.append(file.read(rectangle, plane, scene))
+    data = np.stack(planes).reshape(*counts.values(), *planes[0].shape)
+    return data, "".join(axis if axis in "TZC" else _NO_LETTER for axis in counts) + "YXS"
+
+
+def _is_there(file: Any, plane: dict[str, int], rectangle: Any) -> bool:
+    """Whether any pixel of a plane was written: what wasn't is read as 0."""
+    found: list[int] = []
+
+    def note(index: int, _: object) -> bool:
+        found.append(index)
+        return False  # one is enough
+
+    file.enumerate_subblocks_subset(note, plane, rectangle, True)
+    return bool(found)
+
+
 def setup_in_czi(path: Path) -> StatedSetup:
     """What a CZI file says of its microscope."""
-    with package("czifile", path).CziFile(path) as file:
-        return _setup(ElementTree.fromstring(file.metadata()))
+    with _czi(path).open_czi(str(path)) as file:
+        return _setup(ElementTree.fromstring(file.raw_metadata))
+
+
+def _czi(path: Path) -> ModuleType:
+    return package("pylibCZIrw.czi", path)
 
 
 def _scaling(root: ElementTree.Element, axis: str) -> float | None:
     length = _number(root, f".//Scaling/Items/Distance[@Id='{axis}']/Value")
-    return None if length is None else length * _METRE
+    return None if length is None else float(f"{length * _METRE:.12g}")  # 1e-7 m are 0.1 µm, not 0.0999…
 
 
 def _setup(root: ElementTree.Element) -> StatedSetup:
