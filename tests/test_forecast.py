@@ -5,11 +5,14 @@ import math
 import pytest
 import torch
 
+from recon.fit.newton.correction import drafts
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
-from recon.report.forecast import Bar, Forecast
+from recon.report import forecast as forecast_room
+from recon.report.forecast import WITH_GRADIENT, Bar, Forecast, spoken
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+from torchdic.planning.cost import work
 
 GRID = Grid((4, 12, 10), (0.5, 0.25, 0.25))
 ACQUISITION = Acquisition([Prism((0.0, 0.2), 1.2)], [-1.0, 1.0])
@@ -26,11 +29,31 @@ def problem(fidelity=None, **recipe):
 @pytest.mark.parametrize("fidelity", [None, 0.1])
 def test_the_time_before_the_first_step_is_that_of_all_steps(method, fidelity):
     forecast = Forecast(problem(fidelity, method=method))
-    left = forecast.left(0)
-    if fidelity is not None:
-        assert left is None  # the fidelity has yet to be planned
+    assert forecast.left(0) is None  # before the trial
+    whole, left = forecast.whole(), forecast.left(0)
+    if fidelity is not None and method == "adam":
+        assert whole is left is None  # the fidelity has yet to be planned
     else:
-        assert 0 < left < math.inf
+        assert 0 < whole < math.inf
+        # Newton's ends by itself, after fewer steps than it may take
+        assert whole == pytest.approx(left) if method == "adam" else whole < 0.95 * left
+
+
+def test_the_trial_is_an_image_with_its_gradient(monkeypatch):
+    """Its seconds, over its cost, are the rate of all steps."""
+    monkeypatch.setattr(forecast_room, "timed", lambda run, repeats, _: [run() or 2.0] * repeats)
+    made = problem(steps=6)
+    first = drafts(made.fidelity.coarse, made.fidelity.draft_sources)[0]
+    forecast = Forecast(made)
+    image = work(first, made.setup.volume, made.setup.microscope, made.setup.acquisition)
+    costs = sum(forecast.cost(number) for number in range(6))
+    assert forecast.whole() == pytest.approx(2.0 * costs / (WITH_GRADIENT * image))
+    assert forecast.whole(5) == pytest.approx(2.0 * forecast.cost(5) / (WITH_GRADIENT * image))
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s"), (99.4, "99 s"), (150, "2 min"), (7200, "2.0 h")])
+def test_a_time_in_words(seconds, words):
+    assert spoken(seconds) == words
 
 
 def test_steps_that_cost_what_was_foreseen_leave_what_was_foreseen():

@@ -3,9 +3,11 @@
 import warnings
 from collections import deque
 from collections.abc import MutableMapping
+from dataclasses import replace
 from statistics import mean
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from recon.fit.newton.correction import drafts
@@ -14,7 +16,7 @@ from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from torchdic import Acquisition, Fidelity, Microscope, Volume
 from torchdic.instrument.microscope import limited
-from torchdic.planning.cost import directions, seconds, work
+from torchdic.planning.cost import directions, timed, work
 from torchdic.scalar import number
 
 # What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
@@ -23,17 +25,22 @@ from torchdic.scalar import number
 WITH_GRADIENT, MODEL, HESSIAN, RENEWED, MISSED = 2.75, 100.0, 4.0, 1 / 3, 0.7
 # Steps whose seconds are averaged.
 LAST = 3
+# Newton's steps end by themselves, as a rule after about so many.
+USUAL_STEPS = 17
+# A trial that takes fewer seconds is made TRIALS times: the first images of a process take longer.
+SHORT, TRIALS = 0.5, 3
 
 
 class Forecast:
     """The seconds that are left of a descent.
 
     A step's cost is known in images, and its seconds from the steps of its kind that have been taken; before there are
-    any, from those of another kind, or from a part of an image that is timed.
+    any, from those of another kind, or from a trial: an image of the first step, with its gradient, that is timed.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
+        self._trial: float | None = None
         self._costs = [_cost(problem, number) for number in range(problem.steps)]
         self._last: deque[tuple[float, float]] = deque(maxlen=LAST)
         self._of_kind: dict[float, deque[float]] = {}
@@ -48,6 +55,17 @@ class Forecast:
         self._last.append((cost, spent))
         self._of_kind.setdefault(cost, deque(maxlen=LAST)).append(spent)
 
+    def whole(self, number: int = 0) -> float | None:
+        """The seconds that a descent will take after a step, if it ends when descents do; None is unknown.
+
+        The first call makes the trial. number: steps so far. Raises as the images of a step do.
+        """
+        if self._trial is None and not self._last and (first := _first(self._problem)) is not None:
+            self._trial = _trial(self._problem, first) / (WITH_GRADIENT * work(first, *_scene(self._problem)))
+        usual = USUAL_STEPS if self._problem.method == "newton" else len(self._costs)
+        rate = self._rate()
+        return None if rate is None else rate * sum(self._costs[number : max(usual, number + 1)])
+
     def left(self, number: int) -> float | None:
         """The seconds that the steps after one will take, if all are taken. number: steps so far. None is unknown."""
         rate = self._rate() if number < len(self._costs) else 0.0
@@ -61,13 +79,39 @@ class Forecast:
         if self._last:
             costs, spent = (sum(column) for column in zip(*self._last, strict=True))
             return spent / costs
-        fidelity = _careful(self._problem)
-        if fidelity is None:
-            return None
-        scene = _scene(self._problem)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the descent's own images will warn
-            return seconds(*scene, fidelity) / work(fidelity, *scene)
+        return self._trial
+
+
+def spoken(seconds: float) -> str:
+    """A time in words."""
+    if seconds < 100:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def _first(problem: Problem) -> Fidelity | None:
+    """The fidelity of the first step; None where it has yet to be planned."""
+    if problem.method == "newton":
+        return drafts(problem.fidelity.coarse, problem.fidelity.draft_sources)[0]
+    if not isinstance(problem.fidelity, GivenFidelity):
+        return None
+    return problem.fidelity.at(0, problem.steps, problem.setup, ())[0]
+
+
+def _trial(problem: Problem, fidelity: Fidelity) -> float:
+    """The seconds of an image with its gradient."""
+    setup, device = problem.setup, problem.misfit.data.device
+
+    def image_with_gradient() -> None:
+        delta = problem.misfit.data.new_zeros(setup.volume.grid.shape).requires_grad_()
+        volume = Volume(setup.volume.grid, delta, setup.volume.background, setup.volume.absorption)
+        images = replace(setup, volume=volume).images(fidelity)
+        torch.autograd.grad(problem.misfit(images), delta)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the descent's own images will warn
+        (first,) = timed(image_with_gradient, 1, device)
+        return first if first > SHORT else min(timed(image_with_gradient, TRIALS, device))
 
 
 def _scene(problem: Problem) -> tuple[Volume, Microscope, Acquisition]:

@@ -6,21 +6,44 @@ from pathlib import Path
 from tqdm import tqdm
 
 from recon.fit.descent import minimise
-from recon.fit.planned import announce_record
+from recon.fit.planned import GivenFidelity, announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
-from recon.report.forecast import Bar, Forecast
+from recon.misfit.gaussian import GaussianMisfit
+from recon.report.forecast import USUAL_STEPS, Bar, Forecast, spoken
 from recon.run.checkpoint import Checkpoint, save, save_if_possible
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
 from recon.run.results import leave_interrupted
+from recon.run.room import bytes_of_descent
 from torchdic.errors import StackError
 from torchdic.files.whole import WriteError
+from torchdic.memory.free import GIB
 
 LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 
 # What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's own error).
 STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
+
+
+# Seconds from which on it is worth some more to foresee the memory, too.
+LONG = 60.0
+
+
+def tell_foreseen(problem: Problem, forecast: Forecast, number: int) -> None:
+    """Print what the rest of a descent will take; nothing where its fidelity has yet to be planned.
+
+    number: steps so far.
+    """
+    seconds = forecast.whole(number)
+    if seconds is None:
+        return
+    words = f"foreseen: {spoken(seconds)}"
+    if seconds > LONG and isinstance(problem.fidelity, GivenFidelity):
+        words += f" and {bytes_of_descent(problem, GaussianMisfit) / GIB:.2g} GiB"
+    if problem.method == "newton" and problem.steps > USUAL_STEPS:
+        words += f", if it ends after {USUAL_STEPS} of {problem.steps} steps, as is usual"
+    tqdm.write(words)
 
 
 # Leaves the volume of a step at which a descent was stopped, and says in words where. Raises StackError.
@@ -51,10 +74,11 @@ def descend_recorded(
     steps, before = minimise(problem, step), 0.0 if step is None else step.seconds
     with (
         open_log(out / LOG, rows) as log,
-        Bar(Forecast(problem), problem.steps, len(rows)) as bar,
+        Bar(forecast := Forecast(problem), problem.steps, len(rows)) as bar,
         signals_kept() as check_signals,
     ):
         try:
+            tell_foreseen(problem, forecast, len(rows))
             for latest in steps:
                 good, step = step, latest
                 log.add(step.row)

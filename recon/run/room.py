@@ -48,15 +48,19 @@ def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit])
     """
     if not isinstance(problem.fidelity, GivenFidelity):
         return
-    fidelity, data = problem.fidelity.fidelity, problem.misfit.data
-    free = free_bytes(data.device)
+    free = free_bytes(problem.misfit.data.device)
     if free is None or _ample(problem) <= free:
         return
-    setup = problem.setup
+    shape = "×".join(map(str, problem.setup.volume.grid.shape))
+    check_room(bytes_of_descent(problem, misfit), free, f"Steps of a reconstruction of {shape} voxels")
+
+
+def bytes_of_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
+    """The bytes that a descent of a given fidelity needs at least, beside its data. misfit: as above."""
+    assert isinstance(problem.fidelity, GivenFidelity)
+    fidelity, setup = problem.fidelity.fidelity, problem.setup
     images = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least
-    wanted = images + held_beside_images(problem, misfit, fidelity)
-    shape = "×".join(map(str, setup.volume.grid.shape))
-    check_room(wanted, free, f"Steps of a reconstruction of {shape} voxels")
+    return images + held_beside_images(problem, misfit, fidelity)
 
 
 def _ample(problem: Problem) -> int:
