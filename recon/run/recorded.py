@@ -75,10 +75,8 @@ def descend_recorded(
             log.add(step.row)  # the signal may have come between the step and its row
             left = leave_stopped(out, problem, Checkpoint(step, log.rows, identity), leave)
             raise InterruptedRunError(f"interrupted after step {step.number} of {problem.steps}; {left}") from None
-        except FolderInUseError:
-            raise
         except STOPPING as error:
-            kept = good if isinstance(error, FloatingPointError) else step
+            kept = _last_good(error, good, step)
             known = as_shortage(error)
             if kept is not None:
                 done = [row for row in log.rows if row[0] <= kept.number]
@@ -88,6 +86,13 @@ def descend_recorded(
         assert step is not None
         keep_folder(out)
         return Checkpoint(step, log.rows, identity)
+
+
+def _last_good(error: Exception, before: Step | None, step: Step | None) -> Step | None:
+    """The step to keep after an error: none where the folder is another run's by now."""
+    if isinstance(error, FolderInUseError):
+        return None
+    return before if isinstance(error, FloatingPointError) else step
 
 
 def _save(out: Path, checkpoint: Checkpoint) -> None:
