@@ -186,19 +186,17 @@ def write_results(
         if ended.rows:
             figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
 
-    _write_each(
-        out,
-        {
-            VOLUME: lambda: _write_volume(out / VOLUME, delta, grid),
-            METRICS: lambda: write_json(out / METRICS, found),
-            RESOLVED: lambda: leave_resolved(config, out, *notes),
-            "opl.ome.tif": write_sections,
-            IMAGES: lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
-            "images.png": draw_images,
-            "sections.png": lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
-            "misfit.png": draw_misfit,
-        },
-    )
+    writers = {
+        VOLUME: lambda: _write_volume(out / VOLUME, delta, grid),
+        METRICS: lambda: write_json(out / METRICS, found),
+        RESOLVED: lambda: leave_resolved(config, out, *notes),
+        "opl.ome.tif": write_sections,
+        IMAGES: lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
+        "images.png": draw_images,
+        "sections.png": lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
+        "misfit.png": draw_misfit,
+    }
+    _write_each(out, writers)
     (out / INTERRUPTED).unlink(missing_ok=True)
     _tell_of_earlier(out)
     return Result(delta, found)
