@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-all test-view stability lint bench clean
+.PHONY: demo test test-all test-view faults stability lint bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -17,7 +17,7 @@ demo: $(INSTALLED)
 # tests run side by side, each on one thread: a test's tensors are too small for more
 test test-all: export OMP_NUM_THREADS := 1
 # what one process compiles is kept for the others
-test test-all: export PYTHONDONTWRITEBYTECODE :=
+test test-all faults: export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
 test: $(INSTALLED)
@@ -30,6 +30,11 @@ test-all: $(INSTALLED)
 test-view: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,view]"
 	$(BIN)/python -m pytest tests/test_view.py tests/test_makers.py
+
+# disks that fill are small ones of their own: to mount them takes root's rights, or a namespace in which one has them
+faults: $(INSTALLED)
+	$$(unshare --map-root-user --mount true 2>/dev/null && echo unshare --map-root-user --mount) \
+		$(PYTEST) --table -m faults tests/faults
 
 stability: $(INSTALLED)
 	$(BIN)/python -m pytest --table tests/test_stability.py tests/test_properties.py

@@ -171,7 +171,9 @@ def pytest_configure(config):
 
 
 def pytest_addoption(parser):
-    parser.addoption("--table", action="store_true", help="print the laws of test_stability.py and what was measured")
+    parser.addoption(
+        "--table", action="store_true", help="print what was measured by test_stability.py and tests/faults"
+    )
 
 
 def pytest_terminal_summary(terminalreporter):
@@ -187,6 +189,8 @@ def pytest_terminal_summary(terminalreporter):
                 form = ".4f" if law == "light" else ".1e"
                 numbers = f" {measured:{form}} ≤ {limit:{form}}" if limit else ""
                 rows.setdefault((case, propagation), {})[kind, dtype] = law + numbers
+    if not rows:
+        return
     columns = [(kind, dtype) for kind in ("image", "gradient") for dtype in ("float64", "float32")]
     terminalreporter.section("stability")
     terminalreporter.write_line("| case | propagation | " + " | ".join(map(" ".join, columns)) + " |")

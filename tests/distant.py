@@ -6,6 +6,7 @@ but for 0-d ones of the CPU, and whoever reads a value, or copies one there, wai
 
 import os
 import sys
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -54,10 +55,16 @@ class Distant(Tensor):
 
 
 class Device:
-    """While it is entered, distant tensors work. waits: how often the CPU waited for the device, by what and where."""
+    """While it is entered, distant tensors work.
 
-    def __init__(self) -> None:
+    room: bytes that it holds at once, beyond which torch.OutOfMemoryError is raised as on a GPU; None is no limit.
+    waits: how often the CPU waited for the device, by what and where. most: bytes that were held at once.
+    """
+
+    def __init__(self, room: int | None = None) -> None:
         self.waits: Counter[str] = Counter()
+        self.room, self.most = room, 0
+        self._known: dict[int, int] = {}
         self._within = ExitStack()
 
     def __enter__(self) -> "Device":
@@ -67,6 +74,18 @@ class Device:
 
     def __exit__(self, *failure: object) -> None:
         self._within.close()
+
+    def take(self, held: Tensor) -> None:
+        """Count the bytes of what a distant tensor holds until they are freed; torch's error where there is no room."""
+        storage = held.untyped_storage()
+        key = storage._cdata
+        if key in self._known:
+            return
+        now = sum(self._known.values()) + storage.nbytes()
+        if self.room is not None and now > self.room:
+            raise torch.OutOfMemoryError(f"CUDA out of memory. Tried to allocate {storage.nbytes() / 1024:.2f} KiB. …")
+        self._known[key], self.most = storage.nbytes(), max(self.most, now)
+        weakref.finalize(storage, self._known.pop, key)
 
     def wait(self, what: str) -> None:
         """Count one, and whose it is."""
@@ -124,7 +143,10 @@ class _Kernels(TorchDispatchMode):
         def wrapped(leaf: object) -> object:
             if not (isinstance(leaf, Tensor) and to_distant):
                 return leaf
-            return ours[id(leaf)] if id(leaf) in ours else Distant(leaf)
+            if id(leaf) in ours:
+                return ours[id(leaf)]
+            self._device.take(leaf)
+            return Distant(leaf)
 
         held_args, held_kwargs = _mapped(_held, (args, kwargs))
         if distant:  # and not a number, whose conjugate is asked for too

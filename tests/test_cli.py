@@ -436,19 +436,27 @@ def test_a_simulation_without_room_is_refused_in_one_line(write, refused, monkey
 
 
 @pytest.mark.parametrize(
-    "room", [(2000, "4 arrays of 4×14×12 voxels"), (45_000, "reconstruction of 4×14×12 voxels")], ids=["2 kB", "45 kB"]
+    "room",
+    [
+        (2000, "Images of 2×3×14×12 pixels, prepared", 4),
+        (50_000, "4 arrays of 40×14×12 voxels", 40),
+        (45_000, "reconstruction of 4×14×12 voxels", 4),
+        (45_000_000, "Pictures and files of the results", 4),
+    ],
+    ids=["2 kB", "50 kB", "45 kB", "45 MB"],
 )
 @pytest.mark.parametrize("recipe", [{}, {"method": "adam"}, {"method": "adam", "start": "zero"}], ids=str)
 @pytest.mark.usefixtures("no_pictures")
 def test_a_reconstruction_without_room_is_refused_before_it_begins(
     write, run, refused, monkeypatch, tmp_path, recipe, room
 ):
-    free, wanted = room
+    free, wanted, slices = room
     run("simulate", write())
     (tmp_path / "stack.ome.tif").write_bytes((tmp_path / "out" / "stack.ome.tif").read_bytes())
     before = sorted((tmp_path / "out").iterdir())
     monkeypatch.setattr("torchdic.memory.free.available", lambda: free)
-    line = refused("reconstruct", write({f"reconstruction.{key}": value for key, value in recipe.items()}))
+    recipe = {f"reconstruction.{key}": value for key, value in recipe.items()}
+    line = refused("reconstruct", write({"volume.shape": [slices, 14, 12], **recipe}))
     assert wanted in line
     assert sorted((tmp_path / "out").iterdir()) == before
 

@@ -102,7 +102,10 @@ def test_a_result_without_room_is_named_and_the_others_are_kept(run, full, name)
     code, told, left = run("reconstruct")
     assert code == 2
     assert told[-1].startswith("torchdic: error: ")
-    assert f"{name}: cannot be written: No space left on device; make room and go on with --resume" in told[-1]
+    assert (
+        f"{name}: cannot be written: No space left on device; make room and go on with --resume, from step 2"
+        in told[-1]
+    )
     assert left == RESULTS - {name, "README.txt"} | {"checkpoint.pt"}
 
 
@@ -112,6 +115,20 @@ def test_an_index_without_room_is_told_and_loses_nothing(run, full):
     assert code == 0
     assert "README.txt: cannot be written: No space left on device" in told[-1]
     assert left == RESULTS - {"README.txt"}
+
+
+def test_a_picture_for_which_no_memory_is_left_is_named_and_the_others_are_kept(run, monkeypatch):
+    def save(_, path):
+        if path.name == "images.png":
+            raise MemoryError("Unable to allocate 7.5 GiB for an array")
+        path.touch()
+
+    monkeypatch.setattr(figures, "save", save)
+    code, told, left = run("reconstruct")
+    assert code == 2
+    assert "images.png: cannot be written: the memory ran out: another 7.5 GiB were asked for" in told[-1]
+    assert told[-1].endswith("go on with --resume, from step 2")
+    assert left == RESULTS - {"images.png", "README.txt"}
 
 
 def test_a_run_whose_results_had_no_room_goes_on_to_write_them(run, monkeypatch, full, tmp_path):
@@ -186,7 +203,7 @@ def test_a_log_without_room_is_told_once_and_kept_in_memory():
         log.add((2, *row[1:]))
     (message,) = (str(warning.message) for warning in told if warning.category is UnsavedWarning)
     assert message.startswith("/dev/full: cannot be written: ")
-    assert message.endswith("; the run goes on without its log")
+    assert message.endswith("; the run goes on, and tries again at its end")
     assert [number for number, *_ in log.rows] == [1, 2]
 
 

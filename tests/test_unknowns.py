@@ -316,7 +316,7 @@ def test_the_sample_of_a_descent_holds_what_its_later_steps_hold(truth, method):
     whole = most(course_of(descend))
     found = held_beside_images(made, GaussianMisfit, fidelity) + most(course_of(compute))
     assert 0.95 * whole < found < 1.5 * whole
-    assert whole < _ample(made)
+    assert whole < _ample(made.setup)
 
 
 @NEWTON_SLOW

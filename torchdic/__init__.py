@@ -13,6 +13,7 @@ the two beams. Intensity is relative to the empty bright field, so an empty DIC 
 from torchdic.errors import (
     ApertureWarning,
     SamplingWarning,
+    ShortageWarning,
     ShortOfMemoryError,
     SidewaysError,
     SlabWarning,
@@ -68,6 +69,7 @@ __all__ = [
     "Rays",
     "SamplingWarning",
     "ShortOfMemoryError",
+    "ShortageWarning",
     "SidewaysError",
     "SlabWarning",
     "Spectrum",

@@ -68,6 +68,10 @@ class ShortOfMemoryError(MemoryError):
     """
 
 
+class ShortageWarning(UserWarning):
+    """A GPU's memory ran out although there seemed to be room; the computation goes on in smaller batches."""
+
+
 class ToleranceWarning(UserWarning):
     """No fidelity that was tried meets the tolerance. The message says by how much the best one misses it, and why."""
 

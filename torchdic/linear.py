@@ -34,6 +34,7 @@ from torchdic.imaging.pupil import Pupil, Waves
 from torchdic.instrument.microscope import Acquisition, Microscope, in_medium
 from torchdic.instrument.prism import Prism
 from torchdic.memory.batches import sum_over_sources
+from torchdic.memory.free import spared
 from torchdic.plane_waves import exp_i, to_field, to_spectrum
 from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
@@ -244,7 +245,7 @@ def _kernel_of_colour(
     pixels = grid.shape[1] * grid.shape[2]
     # complex planes, and the phases from which they are made
     each = 4 * planes * pixels * momentum.element_size()
-    M = sum_over_sources(contribution, (momentum, weights), max(1, fidelity.memory // each))
+    M = sum_over_sources(contribution, (momentum, weights), max(1, spared(fidelity.memory, device) // each))
     return M, through
 
 

@@ -17,9 +17,10 @@ from recon.run.folder.lock import FolderInUseError, folders_released, hold
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
-from torchdic import ApertureWarning, SamplingWarning, ShortOfMemoryError, ToleranceWarning
+from torchdic import ApertureWarning, SamplingWarning, ToleranceWarning
 from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
+from torchdic.memory.shortage import as_shortage, is_shortage
 
 # What the user can put right, in one line that says what.
 WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
@@ -40,14 +41,24 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)
     except TurnedRaysError as error:
-        return _fail(f"{options.config}: {error}; the wave may cross it", BAD_INPUT)
-    except (UnstableError, SidewaysError, ShortOfMemoryError) as error:
-        return _fail(f"{options.config}: {error}", BAD_INPUT)
+        return _fail(f"{_input(options)}{error}; the wave may cross it", BAD_INPUT)
+    except (UnstableError, SidewaysError) as error:
+        return _fail(f"{_input(options)}{error}", BAD_INPUT)
     except (FloatingPointError, SelfTestError) as error:
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)
     return 0
+
+
+def _input(options: argparse.Namespace) -> str:
+    """What the command works on, to stand before an error."""
+    found = (getattr(options, name, None) for name in ("config", "folder"))
+    return "".join(f"{path}: " for path in found if path is not None)
 
 
 def _hold_folder(options: argparse.Namespace) -> None:

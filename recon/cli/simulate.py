@@ -1,6 +1,7 @@
 """torchdic simulate: the DIC images of a known specimen."""
 
 import argparse
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,11 @@ from recon.config.resolved import RESOLVED, leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.planned import announce
 from recon.report import figures
-from recon.run.exact_images import exact_images
+from recon.run.data import camera_pixels
+from recon.run.exact_images import check_room_for_exact, exact_images
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
+from recon.run.room import check_room_for_report
 from torchdic import STANDARD, Fidelity, Volume, image, plan
 from torchdic.files.stack import equal_step, write_stack
 from torchdic.files.whole import write_json
@@ -47,8 +50,9 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _from_the_exact_field(config: Config, specimen: Any, out: Path) -> Tensor:
-    prepare_folder(out)
     assert config.fidelity is not None
+    check_room_for_exact(config.volume.grid, config.acquisition, config.fidelity)  # before the folder is made
+    _prepare(config, out)
     return exact_images(specimen, config.volume.grid, config.microscope, config.acquisition, config.fidelity)
 
 
@@ -59,11 +63,18 @@ def _by_a_propagation(config: Config, specimen: Any, out: Path, device: torch.de
         assert config.fidelity is not None
         fidelity = config.fidelity
         check_fits(volume, config.microscope, config.acquisition, fidelity)  # before the folder is made
-        prepare_folder(out)
+        _prepare(config, out)
     else:
-        prepare_folder(out)
+        _prepare(config, out)
         fidelity = _planned(config, volume, config.tolerance, out)
     return image(volume, config.microscope, config.acquisition, fidelity).cpu()
+
+
+def _prepare(config: Config, out: Path) -> None:
+    """Make the folder, where there is room for what will be written into it."""
+    prisms, planes = len(config.acquisition.prisms), len(config.acquisition.focus)
+    check_room_for_report(prisms * planes * math.prod(camera_pixels(config).shape[1:]))
+    prepare_folder(out)
 
 
 def _planned(config: Config, volume: Volume, tolerance: float, out: Path) -> Fidelity:

@@ -27,8 +27,8 @@ from torchdic import Fidelity, Grid
 from torchdic.linear import linear_image, transfer_functions
 from torchdic.scalar import number
 
-# Bytes that the blocks of some rows of frequencies may take at once.
-_MEMORY = 256 << 20
+# Bytes that the transfer's sources may take at once. The systems of some rows of frequencies may take a quarter of it.
+MEMORY = 1 << 30
 
 # Of the cross-validation. A strong specimen with little noise needs it: there the plain one's Δn is without limit.
 _ROBUSTNESS = 0.3
@@ -57,11 +57,11 @@ class LinearModel:
     """The linear images of Δn, each divided by its prism's spatial standard deviation, and without the empty field.
 
     grid: of the volume. transfer: (prism·focus, z, y, x/2 + 1), the frequencies of a real FFT. The other half of them
-    is the complex conjugate.
+    is the complex conjugate. memory: bytes that the blocks of some rows of frequencies may take at once.
     """
 
-    def __init__(self, grid: Grid, transfer: Complex[Tensor, "image z y half"]) -> None:
-        self.grid, self.transfer = grid, transfer
+    def __init__(self, grid: Grid, transfer: Complex[Tensor, "image z y half"], memory: int = MEMORY // 4) -> None:
+        self.grid, self.transfer, self.memory = grid, transfer, memory
 
     def images(self, delta: Float[Tensor, "z y x"]) -> Float[Tensor, "image y x"]:
         """A·Δn."""
@@ -85,7 +85,7 @@ class LinearModel:
         spectrum = torch.fft.rfft2(images.double())
         # A twice, and the products with their eigenvectors and workspace
         each = 16 * half * (2 * m * nz + 4 * nz * nz)
-        rows = max(1, _MEMORY // each)
+        rows = max(1, self.memory // each)
         for first in range(0, ny, rows):
             part = slice(first, min(first + rows, ny))
             A = self.transfer[:, :, part].permute(2, 3, 0, 1).to(torch.complex128)
@@ -100,6 +100,7 @@ def tikhonov(
     noise: float | Sequence[float] | None,
     bounds: Bounds = FREE,
     sources: int = 40,
+    memory: int = MEMORY,
 ) -> Tikhonov:
     """Δn whose linear images explain the data as closely as the noise allows, with the least Σ|Δn|².
 
@@ -109,7 +110,8 @@ def tikhonov(
     is unknown. It sets the weight, see `recon.earlier.weight`.
     bounds: of Δn. The weight is that of the free Δn, and the same sum is then lowered within the bounds, where
     the misfit is higher.
-    sources: condenser directions of the transfer function.
+    sources: condenser directions of the transfer function. memory: bytes that its batches of sources may take at once,
+    and its systems a quarter of it.
 
     The images see nothing of each slice's mean: it is 0 where there are no bounds. The transfer function is held
     whole, (prism·focus, z, y, x/2 + 1) complex numbers of the data's precision; the systems are made in parts.
@@ -121,9 +123,9 @@ def tikhonov(
     check_images(data, setup)
     misfit = GaussianMisfit(data)
     levels = noise_of_prisms(noise, len(data))
-    fidelity = Fidelity("wave", sources=sources)
+    fidelity = Fidelity("wave", sources=sources, memory=memory)
     scale = misfit.variance.rsqrt()
-    model = LinearModel(volume.grid, _weighted_transfer(setup, fidelity, scale))
+    model = LinearModel(volume.grid, _weighted_transfer(setup, fidelity, scale), memory // 4)
     empty = linear_image(empty_medium(volume.grid, number(volume.background), data), microscope, acquisition, fidelity)
     d = (scale * (data - empty)).flatten(0, 1)
     components = _components(model, d)

@@ -12,6 +12,8 @@ from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from torchdic import Acquisition, Fidelity, Grid, Microscope
+from torchdic.memory.batches import halved_batches
+from torchdic.memory.shortage import announce_halving, may_be_halved
 
 # The descents by their names.
 DESCENTS: dict[str, Callable[[Problem, Step | None], Iterator[Step]]] = {
@@ -52,7 +54,30 @@ def minimise(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
     """Lower the misfit and the priors of a problem by its method; yields every step.
 
     resume: the step to go on from; the rest is as if there had been no interruption.
+    Where a GPU's memory runs out, the step is taken again with batches of half the sources, and the later ones too;
+    ShortageWarning says so.
     Raises ValueError where the step has other unknowns or is another method's, and FloatingPointError where the fit
     diverges.
     """
-    yield from DESCENTS[problem.method](problem, resume)
+    descent, last = DESCENTS[problem.method], resume
+    try:
+        for step in descent(problem, resume):
+            last = step
+            yield step
+    except (MemoryError, RuntimeError) as error:
+        if not may_be_halved(error, problem.misfit.data.device):
+            raise
+        announce_halving(error, problem.misfit.data.device)
+    else:
+        return
+    yield from _halved(descent(problem, last))
+
+
+def _halved(steps: Iterator[Step]) -> Iterator[Step]:
+    """Each step computed with batches of half the sources; what the caller computes in between isn't."""
+    while True:
+        with halved_batches():
+            step = next(steps, None)
+        if step is None:
+            return
+        yield step

@@ -9,6 +9,7 @@ import torch
 
 from recon.fit.step import Row, Step
 from torchdic.files.whole import WriteError, written_whole
+from torchdic.memory.shortage import is_shortage
 
 # Number of the format that is written and read. Checkpoints of before the second had none.
 FORMAT = 2
@@ -68,6 +69,8 @@ def load(path: Path, identity: str) -> Checkpoint:
         earlier = _is_earlier(content)
         checkpoint = None if earlier else Checkpoint(Step(**content["step"]), content["rows"], content["identity"])
     except Exception as error:
+        if is_shortage(error):
+            raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise CheckpointError(f"{path}: is no checkpoint of this version: {reason}") from error
     if checkpoint is None:

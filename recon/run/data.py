@@ -1,5 +1,7 @@
 """The measured stack that a configuration names, in the model's unit."""
 
+import os
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +19,16 @@ from recon.recording.preparation import ExpectedStack, Measured, Normalisation, 
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from recon.recording.support import edges_support
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
-from torchdic.errors import StackError
+from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
 from torchdic.files.joined import read_joined
 from torchdic.files.stack import read_stack
+from torchdic.memory.free import check_room, free_bytes
 
 # Condenser directions of the empty field where the fidelity has yet to be planned.
 MANY_SOURCES = 200
+# Bytes that preparing a stack takes at most beside it, for each of its pixels.
+PREPARED = 24
 
 
 def load_data(config: Config) -> Measured:
@@ -37,6 +42,27 @@ def load_data(config: Config) -> Measured:
         raise ConfigError("missing key data.path: a reconstruction needs a stack")
     check_feasible(config)
     return prepared(config, read_joined(section.files, section.channels, section.series))
+
+
+def looks(config: Config) -> dict[str, tuple[int, int] | None]:
+    """Size and time of the last change of each of the stack's files; None where a file can't be looked at."""
+
+    def look(name: str) -> tuple[int, int] | None:
+        try:
+            found = os.stat(name)
+        except OSError:
+            return None
+        return found.st_size, found.st_mtime_ns
+
+    return {name: look(name) for name in (config.data.files if config.data is not None else ())}
+
+
+def warn_of_changes(config: Config, before: dict[str, tuple[int, int] | None]) -> None:
+    """Warn StackWarning of each file of the stack that looks different by now. before: how they looked."""
+    for name, now in looks(config).items():
+        if now != before[name]:
+            told = f"{name}: has changed since it was read; the volume is of what was read, and can't go on with this"
+            warnings.warn(told, StackWarning, stacklevel=3)
 
 
 def prepared(config: Config, stack: Stack) -> Measured:
@@ -55,6 +81,8 @@ def prepared(config: Config, stack: Stack) -> Measured:
     )
     normalisation = Normalisation(section.flatten, section.scale, section.offset, section.order)
     check_counts(stack, expected)
+    shape = "×".join(map(str, stack.data.shape))
+    check_room(PREPARED * stack.data.size, free_bytes(torch.device("cpu")), f"Images of {shape} pixels, prepared,")
     ratio = None
     if section.stuck is not None:
         ratio = sharpest(config.microscope, stack.pixel_size or pixels.spacing[1:], config.volume.background)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchdic import Acquisition, Fidelity, Grid, Microscope, image_field
 from torchdic.instrument.microscope import limited
+from torchdic.memory.free import check_room, free_bytes
 
 # The exact field is computed on an array that is wider than the grid by this fraction on each side. Its images are
 # cropped to the grid, so that light which leaves the grid at one side doesn't come back in at the other.
@@ -16,6 +17,8 @@ WIDENING = 0.5
 
 # Sources whose fields are held at once.
 SOURCES_AT_ONCE = 16
+# Bytes that they take at most for each pixel of that array: for each source, and for each image.
+OF_SOURCE, OF_IMAGE = 48, 16
 
 
 @runtime_checkable
@@ -47,6 +50,14 @@ class ExactSpecimen(Protocol):
         ...
 
 
+def check_room_for_exact(grid: Grid, acquisition: Acquisition, fidelity: Fidelity) -> None:
+    """Raise ShortOfMemoryError where images from an exact field would take more memory than is free."""
+    _, ny, nx = (n + 2 * round(WIDENING * n) for n in grid.shape)
+    images = len(acquisition.prisms) * len(acquisition.focus)
+    wanted = ny * nx * (OF_SOURCE * min(fidelity.sources, SOURCES_AT_ONCE) + OF_IMAGE * images)
+    check_room(wanted, free_bytes(torch.device("cpu")), f"Images from the exact field on {ny}×{nx} pixels")
+
+
 @torch.no_grad()
 def exact_images(
     specimen: ExactSpecimen, grid: Grid, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity
@@ -57,7 +68,9 @@ def exact_images(
     grid: its (y, x) pixels are the images', unless the microscope's camera has pixels of its own.
     microscope, acquisition: as for `torchdic.image`; the camera's noise and counts are left out.
     fidelity: only its number of sources counts.
+    Raises ShortOfMemoryError where there is no room for them.
     """
+    check_room_for_exact(grid, acquisition, fidelity)
     if microscope.spectrum is not None:
         colours = microscope.colours()
         return torch.stack(

@@ -1,6 +1,7 @@
 """A reconstruction from a configuration to a folder of results, which may be interrupted and resumed."""
 
 import hashlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,17 +23,23 @@ from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
-from recon.run.data import load_data, load_support
+from recon.run.data import load_data, load_support, looks, warn_of_changes
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped
 from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
-from recon.run.room import check_room_for_descent, check_room_for_volume
+from recon.run.room import (
+    check_room_for_descent,
+    check_room_for_direct,
+    check_room_for_report,
+    check_room_for_volume,
+)
 from recon.run.tiles.fitting import TiledFit
 from recon.run.tiles.kept import TILES, forget, remember_side
 from recon.run.tiles.sizes import Cut, cut_of
 from torchdic import Fidelity
+from torchdic.memory.shortage import as_shortage
 
 # Without a [fidelity] section. Newton's steps are computed with few directions and corrected to these images, whose
 # error is below the noise of 40 000 photons a pixel; each of Adam's many steps is computed with its own in full, and
@@ -65,7 +72,7 @@ def reconstruct(
     ShortOfMemoryError where there is no room for the descent, before `out` is touched; InterruptedRunError on Ctrl-C,
     with a checkpoint and the volume so far saved; ResultsError where results cannot be written.
     """
-    budget = None if config.fidelity is None else config.fidelity.memory
+    before, budget = looks(config), None if config.fidelity is None else config.fidelity.memory
     config, measured, made, problem, identity = _asked(config, device, misfit)
     start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
     if config.reconstruction.method in DIRECT:
@@ -77,24 +84,36 @@ def reconstruct(
         cut = cut_of(config, problem, made, out, budget)
     else:  # a field of which a fit is under way stays whole
         check_room_for_descent(problem, made)
+    _check_room_for_report(problem)
     prepare_folder(out)
     if cut is not None:
-        return _in_tiles(config, measured, problem, cut, out, identity)
+        result = _in_tiles(config, measured, problem, cut, out, identity)
+        warn_of_changes(config, before)
+        return result
     ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
-    kept = save_if_possible(out / CHECKPOINT, ended)
+    warn_of_changes(config, before)
+    save_if_possible(out / CHECKPOINT, ended)
     try:
         return write_results(out, config, measured, problem, ended)
     except ResultsError as error:
-        raise ResultsError(f"{error}{GO_ON if kept else ''}") from error
+        raise ResultsError(f"{error}; make room and {_how_to_go_on(out, identity)}") from error
     except STOPPING as error:  # the images by which the volume is judged have no room, or can't be followed
-        error.args = (f"{error}; {leave_stopped(out, problem, ended)}",)
-        raise
+        known = as_shortage(error)
+        known.args = (f"{known}; {leave_stopped(out, problem, ended)}",)
+        raise known from known.__cause__
+
+
+def _check_room_for_report(problem: Problem) -> None:
+    check_room_for_report(problem.misfit.data.numel(), math.prod(problem.setup.field.shape))
 
 
 def _solved(config: Config, measured: Measured, problem: Problem, out: Path, identity: str) -> Result:
     """The results of a method without a descent, written into `out`."""
+    section = config.reconstruction
+    check_room_for_direct(section.method, problem.misfit.data, problem.setup, section.bounds)
+    _check_room_for_report(problem)
     try:
-        step, sections = solved_directly(config.reconstruction, problem, measured.noise)
+        step, sections = solved_directly(section, problem, measured.noise)
     except ValueError as error:
         raise ConfigError(f"reconstruction.method: {config.reconstruction.method!r}: {error}") from error
     prepare_folder(out)
@@ -234,6 +253,15 @@ def _identity(config: Config, measured: Measured, problem: Problem) -> str:
     }
     seen = [f"{name}'s sha256 = {_digest(array)}" for name, array in digests.items() if array is not None]
     return "\n".join([*flat(fit), f"misfit = {problem.misfit.name}", *seen])
+
+
+def _how_to_go_on(out: Path, identity: str) -> str:
+    """What the user can do where results could not be written."""
+    try:
+        saved = checkpoint.load(out / CHECKPOINT, identity).step
+    except CheckpointError:
+        return "begin anew"
+    return f"go on with --resume, from step {saved.number}"
 
 
 def _digest(array: np.ndarray) -> str:

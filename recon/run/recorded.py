@@ -6,23 +6,26 @@ from pathlib import Path
 from tqdm import tqdm
 
 from recon.fit.descent import minimise
-from recon.fit.planned import GivenFidelity, announce_record
+from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
 from recon.report.forecast import USUAL_STEPS, Bar, Forecast, spoken
 from recon.run.checkpoint import Checkpoint, save, save_if_possible
+from recon.run.folder.lock import FolderInUseError
+from recon.run.folder.prepared import keep_folder
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
-from recon.run.results import leave_interrupted
+from recon.run.results import VOLUME, leave_interrupted
 from recon.run.room import bytes_of_descent
 from torchdic.errors import StackError
 from torchdic.files.whole import WriteError
 from torchdic.memory.free import GIB
+from torchdic.memory.shortage import as_shortage, is_shortage
 
 LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 
-# What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's own error).
+# What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's is the last).
 STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
 
 
@@ -39,7 +42,7 @@ def tell_foreseen(problem: Problem, forecast: Forecast, number: int) -> None:
     if seconds is None:
         return
     words = f"foreseen: {spoken(seconds)}"
-    if seconds > LONG and isinstance(problem.fidelity, GivenFidelity):
+    if seconds > LONG:
         words += f" and {bytes_of_descent(problem, GaussianMisfit) / GIB:.2g} GiB"
     if problem.method == "newton" and problem.steps > USUAL_STEPS:
         words += f", if it ends after {USUAL_STEPS} of {problem.steps} steps, as is usual"
@@ -62,7 +65,7 @@ def descend_recorded(
 
     out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
     depends on, for the checkpoint. start: to go on from. leave: leaves the volume where the descent is stopped; None
-    leaves it in the folder.
+    leaves it in the folder. A folder that is removed on the way is made anew.
     Raises InterruptedRunError on Ctrl-C or SIGTERM, and what a step raises, FloatingPointError where the fit diverges;
     with a checkpoint and the volume of the last good step saved. Warns UnsavedWarning where the log or a checkpoint
     cannot be written.
@@ -88,38 +91,60 @@ def descend_recorded(
                 bar.step(step.number, step.seconds - before, step.misfit)
                 before = step.seconds
                 if step.number % checkpoint_every == 0:
-                    save_if_possible(out / CHECKPOINT, Checkpoint(step, log.rows, identity))
+                    _save(out, Checkpoint(step, log.rows, identity))
                 check_signals()
         except KeyboardInterrupt:
             if step is None:
                 raise InterruptedRunError("interrupted before the first step") from None
             log.add(step.row)  # the signal may have come between the step and its row
-            stopped = Checkpoint(step, log.rows, identity)
-            line = f"interrupted after step {step.number} of {problem.steps}"
-            raise InterruptedRunError(f"{line}; {leave_stopped(out, problem, stopped, leave)}") from None
+            left = leave_stopped(out, problem, Checkpoint(step, log.rows, identity), leave)
+            raise InterruptedRunError(f"interrupted after step {step.number} of {problem.steps}; {left}") from None
         except STOPPING as error:
-            kept = good if isinstance(error, FloatingPointError) else step
-            if kept is None:
-                raise
-            stopped = Checkpoint(kept, [row for row in log.rows if row[0] <= kept.number], identity)
-            line = f"stopped after step {kept.number} of {problem.steps}; {leave_stopped(out, problem, stopped, leave)}"
-            error.args = (f"{error}; {line}",)
-            raise
+            kept = _last_good(error, good, step)
+            known = as_shortage(error)
+            if kept is not None:
+                done = [row for row in log.rows if row[0] <= kept.number]
+                left = leave_stopped(out, problem, Checkpoint(kept, done, identity), leave)
+                known.args = (f"{known}; stopped after step {kept.number} of {problem.steps}; {left}",)
+            raise known from known.__cause__
         assert step is not None
+        keep_folder(out)
         return Checkpoint(step, log.rows, identity)
+
+
+def _last_good(error: Exception, before: Step | None, step: Step | None) -> Step | None:
+    """The step to keep after an error: none where the folder is another run's by now."""
+    if isinstance(error, FolderInUseError):
+        return None
+    return before if isinstance(error, FloatingPointError) else step
+
+
+def _save(out: Path, checkpoint: Checkpoint) -> None:
+    keep_folder(out)
+    save_if_possible(out / CHECKPOINT, checkpoint)
 
 
 def leave_stopped(out: Path, problem: Problem, stopped: Checkpoint, leave: Leave | None = None) -> str:
     """Leave a checkpoint and the volume of a descent that came to no end; returns a line about them for the user."""
+    keep_folder(out)
     try:
         save(out / CHECKPOINT, stopped)
         line = "go on with --resume"
-    except WriteError as error:
-        line = str(error)
+    except (WriteError, MemoryError, RuntimeError) as error:
+        line = _unsaved(out / CHECKPOINT, error)
     try:
         return f"{line}; {(leave or _leaving(out, problem))(stopped.step)}"
-    except StackError as error:
-        return f"{line}; {error}"
+    except (StackError, MemoryError, RuntimeError) as error:
+        return f"{line}; {_unsaved(out / VOLUME, error)}"
+
+
+def _unsaved(path: Path, error: Exception) -> str:
+    """Why a file isn't there. Raises an error that tells of a fault of the program's."""
+    if is_shortage(error):
+        return f"{path}: cannot be written: no memory is left for it"
+    if isinstance(error, RuntimeError):
+        raise error
+    return str(error)
 
 
 def _leaving(out: Path, problem: Problem) -> Leave:

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from recon.config.resolved import leave_resolved
+from recon.config.resolved import RESOLVED, leave_resolved
 from recon.config.schema import Config
 from recon.fit.planned import announce_record
 from recon.fit.problem import Problem
@@ -28,6 +28,7 @@ from torchdic import Grid
 from torchdic.errors import StackError
 from torchdic.files.stack import equal_step, write_stack, write_volume
 from torchdic.files.whole import WriteError, write_json
+from torchdic.memory.shortage import as_shortage, is_shortage
 
 VOLUME, METRICS = "volume.ome.tif", "metrics.json"
 # Every plane of every prism: as it was measured, brought to the model's unit, and as the model has it.
@@ -185,18 +186,17 @@ def write_results(
         if ended.rows:
             figures.save(figures.draw_misfit(ended.rows), out / "misfit.png")
 
-    _write_each(
-        (
-            lambda: _write_volume(out / VOLUME, delta, grid),
-            lambda: write_json(out / METRICS, found),
-            lambda: leave_resolved(config, out, *notes),
-            write_sections,
-            lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
-            draw_images,
-            lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
-            draw_misfit,
-        )
-    )
+    writers = {
+        VOLUME: lambda: _write_volume(out / VOLUME, delta, grid),
+        METRICS: lambda: write_json(out / METRICS, found),
+        RESOLVED: lambda: leave_resolved(config, out, *notes),
+        "opl.ome.tif": write_sections,
+        IMAGES: lambda: _write_images(out / IMAGES, data, images.cpu(), measured),
+        "images.png": draw_images,
+        "sections.png": lambda: figures.save(figures.draw_sections({"": delta}, grid), out / "sections.png"),
+        "misfit.png": draw_misfit,
+    }
+    _write_each(out, writers)
     (out / INTERRUPTED).unlink(missing_ok=True)
     _tell_of_earlier(out)
     return Result(delta, found)
@@ -239,14 +239,19 @@ def _write_volume(path: Path, delta: Float[Tensor, "z y x"], grid: Grid, name: s
         warnings.warn(f"{error}; it is written compressed instead", UnsavedWarning, stacklevel=2)
 
 
-def _write_each(writers: Sequence[Callable[[], None]]) -> None:
-    """Write each result although another one cannot be written, and raise ResultsError of those at the end."""
+def _write_each(out: Path, writers: Mapping[str, Callable[[], None]]) -> None:
+    """Write each result by its name, although another one cannot be written; raise ResultsError of those at the end."""
     failed: list[str] = []
-    for write in writers:
+    for name, write in writers.items():
         try:
             write()
         except (WriteError, StackError) as error:
             failed.append(str(error))
+        except (MemoryError, RuntimeError) as error:
+            if not is_shortage(error):
+                raise
+            failed.append(f"{out / name}: cannot be written: {as_shortage(error)}")
     if failed:
-        others = f"; nor can {len(failed) - 1} other results" if len(failed) > 1 else ""
+        more = len(failed) - 1
+        others = f"; nor can {more} other result{'s' if more > 1 else ''}" if more else ""
         raise ResultsError(f"{failed[0]}{others}")

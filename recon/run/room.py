@@ -2,18 +2,22 @@
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from recon.fit.bounds import SupportedBounds
+from recon.earlier.path_length import path_length
+from recon.earlier.tikhonov import MEMORY as MEMORY_OF_LINEAR
+from recon.earlier.tikhonov import tikhonov
+from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.descent import minimise
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.newton.secants import MEMORY
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
-from recon.fit.setup import empty_medium
+from recon.fit.setup import Setup, empty_medium
 from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
 from recon.prior.weight import FollowsNoise
@@ -31,6 +35,9 @@ STEPS = {"newton": COARSE_STEPS + MEMORY + 1, "adam": 3}
 LIGHT = 1e-9
 # More bytes than the linear start holds for each pixel, slice, and image or slice.
 LINEAR = 64
+# Bytes that pictures and files of the results hold at most beside them: of each pixel of the images and of each voxel,
+# and of the pictures themselves.
+OF_PIXEL, OF_VOXEL, PICTURES = 32, 24, 64 << 20
 # Arrays of the volume's size that any descent holds: Δn, its gradient and Adam's two moments.
 ARRAYS = 4
 
@@ -43,30 +50,62 @@ def check_room_for_volume(grid: Grid, device: torch.device) -> None:
 def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> None:
     """Raise ShortOfMemoryError where a descent would take more memory than is free.
 
-    misfit: makes the problem's misfit from data. Where the fidelity has yet to be planned, nothing is checked: each
-    image is, when it is computed.
+    misfit: makes the problem's misfit from data. Where the fidelity has yet to be planned, what the descent holds
+    beside its images is checked: each image is, when it is computed.
     """
-    if not isinstance(problem.fidelity, GivenFidelity):
-        return
     free = free_bytes(problem.misfit.data.device)
-    if free is None or _ample(problem) <= free:
+    if free is None or _ample(problem.setup) <= free:
         return
-    shape = "×".join(map(str, problem.setup.volume.grid.shape))
-    check_room(bytes_of_descent(problem, misfit), free, f"Steps of a reconstruction of {shape} voxels")
+    wanted = bytes_of_descent(problem, misfit)
+    check_room(wanted, free, f"Steps of a reconstruction of {_named(problem.setup.volume.grid)} voxels")
 
 
 def bytes_of_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
-    """The bytes that a descent of a given fidelity needs at least, beside its data. misfit: as above."""
-    assert isinstance(problem.fidelity, GivenFidelity)
-    fidelity, setup = problem.fidelity.fidelity, problem.setup
-    images = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least
+    """The bytes that a descent needs at least, beside its data; without its images' where no fidelity is planned yet.
+
+    misfit: makes the problem's misfit from data.
+    """
+    setup, fidelity, images = problem.setup, problem.fidelity.coarse, 0
+    if isinstance(problem.fidelity, GivenFidelity):
+        images = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least
     return images + held_beside_images(problem, misfit, fidelity)
 
 
-def _ample(problem: Problem) -> int:
-    """More bytes than any descent by single sources needs: what fits even so need not be measured."""
-    slices, *sides = problem.setup.volume.grid.shape
-    images = math.prod(problem.setup.shape[:2])
+def check_room_for_report(pixels: int, voxels: int = 0) -> None:
+    """Raise ShortOfMemoryError where the CPU has no room for pictures and files of so many pixels and voxels."""
+    wanted = PICTURES + OF_PIXEL * pixels + OF_VOXEL * voxels
+    check_room(wanted, free_bytes(torch.device("cpu")), "Pictures and files of the results")
+
+
+def check_room_for_direct(method: str, data: Tensor, setup: Setup, bounds: Bounds) -> None:
+    """Raise ShortOfMemoryError where a method without a descent would take more memory than is free.
+
+    method: "linear" or "opl". data: (prism, focus, y, x), on the volume's pixels. bounds: of Δn.
+    """
+    free = free_bytes(data.device)
+    if free is None or _ample(setup) <= free:
+        return
+    few, sample, share = _sample(setup, stand_in(setup.microscope), data.dtype)
+
+    def solve() -> None:
+        with suppress(ValueError):  # which the method itself will raise
+            if method == "linear":
+                tikhonov(sample, few, None, bounds, memory=math.ceil(share * MEMORY_OF_LINEAR))
+            else:
+                path_length(sample, few, None)
+
+    wanted = math.ceil(most(course_of(solve)) / share)
+    check_room(wanted, free, f"A volume of {_named(setup.volume.grid)} voxels by method '{method}'")
+
+
+def _named(grid: Grid) -> str:
+    return "×".join(map(str, grid.shape))
+
+
+def _ample(setup: Setup) -> int:
+    """More bytes than any fit by single sources needs: what fits even so need not be measured."""
+    slices, *sides = setup.volume.grid.shape
+    images = math.prod(setup.shape[:2])
     return math.prod(sides) * (slices + images) * (AMPLE + LINEAR * slices)
 
 
@@ -77,22 +116,9 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
     what the method keeps: Adam its moments; Newton's the Hessian, the secants and the correction of draft images.
     The sample has no margin: its images are as large as the volume, at least as large as the problem's.
     """
-    known, dtype = problem.setup, problem.misfit.data.dtype
-    grid = known.volume.grid
-    few = replace(grid, shape=(grid.shape[0], *(min(n, SIDE) for n in grid.shape[1:])))
-    medium = empty_medium(few, float(known.volume.background), torch.zeros((), dtype=dtype))
-    microscope = stand_in(_of_one_source(known.microscope))
-    recording = {
-        "brightness": stand_in(known.brightness),
-        "drift": stand_in(known.drift),
-        "lamp": stand_in(known.lamp),
-        "margin": 0,
-    }
-    setup = replace(known, volume=medium, microscope=microscope, acquisition=stand_in(known.acquisition), **recording)
-    # values play no part, but images of one brightness are refused
-    data = torch.rand(setup.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
-    ample = replace(fidelity, memory=1 << 62)
-    share = math.prod(few.shape) / math.prod(grid.shape)
+    dtype, microscope = problem.misfit.data.dtype, stand_in(_of_one_source(problem.setup.microscope))
+    setup, data, share = _sample(problem.setup, microscope, dtype)
+    few, ample = setup.volume.grid, replace(fidelity, memory=1 << 62)
     given = GivenFidelity(ample, problem.fidelity.draft_sources, math.ceil(share * (fidelity.memory // 2)))
     # with a light prior every step of Newton's moves, and is remembered
     weight = FollowsNoise(0.0, data.numel(), first=LIGHT) if problem.method == "newton" else problem.weight
@@ -107,11 +133,28 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
 
     def compute_image() -> None:
         learned = torch.zeros(few.shape, dtype=dtype, requires_grad=True)
-        volume = Volume(few, learned, medium.background)
+        volume = Volume(few, learned, setup.volume.background)
         image(volume, microscope, setup.acquisition, ample).sum().backward()
 
     beside = most(course_of(descend)) - most(course_of(compute_image))
-    return math.ceil(beside * math.prod(grid.shape[1:]) / math.prod(few.shape[1:]))
+    return math.ceil(beside / share)
+
+
+def _sample(setup: Setup, microscope: Microscope, dtype: torch.dtype) -> tuple[Setup, Tensor, float]:
+    """A setup of few pixels on the CPU, without a margin, data of its images, and its share of the setup's pixels."""
+    grid = setup.volume.grid
+    few = replace(grid, shape=(grid.shape[0], *(min(n, SIDE) for n in grid.shape[1:])))
+    medium = empty_medium(few, float(setup.volume.background), torch.zeros((), dtype=dtype))
+    recording = {
+        "brightness": stand_in(setup.brightness),
+        "drift": stand_in(setup.drift),
+        "lamp": stand_in(setup.lamp),
+        "margin": 0,
+    }
+    made = replace(setup, volume=medium, microscope=microscope, acquisition=stand_in(setup.acquisition), **recording)
+    # values play no part, but images of one brightness are refused
+    data = torch.rand(made.shape, dtype=dtype, generator=torch.Generator().manual_seed(0))
+    return made, data, math.prod(few.shape) / math.prod(grid.shape)
 
 
 def _of_shape(unknown: Unknown, shape: tuple[int, int, int]) -> Unknown:

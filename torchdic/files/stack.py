@@ -65,7 +65,7 @@ def read_stack(path: str | os.PathLike[str], series: int | None = None) -> Stack
     _check_openable(path, known)
     try:
         stack = known.read(path) if series is None else _read_one(known, path, series)
-    except (StackError, StackWarning):  # the latter where warnings are errors
+    except (StackError, StackWarning, MemoryError):  # StackWarning where warnings are errors
         raise
     except Exception as error:
         # damaged bytes can raise anything, from struct.error to a codec's own error class

@@ -2,10 +2,14 @@
 
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+# What a file's name begins with until it is complete; a process that is killed leaves such files.
+PARTIAL = ".partial-"
 
 
 class WriteError(OSError):
@@ -42,7 +46,7 @@ def folder_written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """As `written_whole`, for a folder: give an empty one beside `path`, which takes its place when the block ends."""
     path = Path(path)
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".", ignore_cleanup_errors=True) as beside:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=PARTIAL, ignore_cleanup_errors=True) as beside:
             partial, earlier = Path(beside) / path.name, Path(beside) / "earlier"
             partial.mkdir()
             yield partial
@@ -60,7 +64,7 @@ def folder_written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def _moved_there(path: Path) -> Iterator[Path]:
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=PARTIAL, suffix=path.suffix)
     os.close(handle)
     partial = Path(name)
     try:
@@ -71,6 +75,15 @@ def _moved_there(path: Path) -> Iterator[Path]:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what processes that were killed have left half written in a folder. Raises OSError where it can't be."""
+    for left in folder.glob(f"{PARTIAL}*"):
+        if left.is_dir():
+            shutil.rmtree(left)
+        else:
+            left.unlink()
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:

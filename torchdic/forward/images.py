@@ -9,6 +9,7 @@ from torchdic.forward.foresee import allot, allot_fields, check_fits
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope, check_sampling, in_medium
+from torchdic.memory.shortage import halved_once
 from torchdic.propagation.presets import STANDARD
 from torchdic.scalar import number, scalar
 from torchdic.specimen.volume import Volume
@@ -27,18 +28,22 @@ def image(
     camera that has a pixel size. Where an aperture exceeds the medium's index, the part beyond the index is dark, and
     ApertureWarning says so. Raises ValueError for a condenser of which no wave enters the medium, and
     ShortOfMemoryError if the computation needs more memory than is free. Warns with SamplingWarning if the voxels are
-    coarser than the light.
+    coarser than the light, and with ShortageWarning where a GPU's memory runs out and batches are halved.
     """
     n0 = number(volume.background)
     microscope = in_medium(microscope, n0, volume.delta.dtype)
     check_sampling(microscope, volume.grid, n0)
     scene = volume, microscope, acquisition, fidelity
-    if fidelity.object_aberration is None:
-        batches = allot(*scene)
-        return Passage.through(*scene).images(batches)
-    check_fits(*scene)
-    passage = Passage.through(*scene)
-    return passage.images(allot(*scene, passage.most_levels))
+
+    def images() -> Tensor:
+        if fidelity.object_aberration is None:
+            batches = allot(*scene)
+            return Passage.through(*scene).images(batches)
+        check_fits(*scene)
+        passage = Passage.through(*scene)
+        return passage.images(allot(*scene, passage.most_levels))
+
+    return halved_once(images, volume.delta.device)
 
 
 def image_field(
@@ -76,4 +81,4 @@ def image_field(
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
     n0 = scalar(background, real)
     passage = FieldPassage(transmission, grid, n0, microscope, acquisition, fidelity)
-    return passage.images(allot_fields(passage))
+    return halved_once(lambda: passage.images(allot_fields(passage)), real.device)

@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from contextvars import ContextVar
 from functools import wraps
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -101,12 +102,33 @@ def in_cache(array: Tensor) -> list[slice]:
     return [slice(first, last) for first, last in pairwise(edges)]
 
 
+# Whether batches have half as many sources as they are said to.
+_halved: ContextVar[bool] = ContextVar("halved", default=False)
+
+
+@contextmanager
+def halved_batches() -> Iterator[None]:
+    """Within this block batches have half as many sources: the memory that was foreseen for them wasn't there."""
+    token = _halved.set(True)
+    try:
+        yield
+    finally:
+        _halved.reset(token)
+
+
+def are_halved() -> bool:
+    """Whether this is within `halved_batches`."""
+    return _halved.get()
+
+
 def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, ...], size: int) -> Tensor:
     """The sum of function(batch of each tensor) over batches of `size` sources.
 
     per_source: tensors whose first axis is the source.
     If there are several batches, the backward pass computes each of them again.
     """
+    if are_halved():
+        size = math.ceil(min(size, len(per_source[0])) / 2)
     if size >= len(per_source[0]):
         return function(*per_source)
     batches = zip(*(t.split(size) for t in per_source), strict=True)

@@ -9,6 +9,7 @@ from torchdic.errors import ShortOfMemoryError
 from torchdic.grid import Grid
 
 GIB = 1 << 30
+LESS = "fewer voxels, prism settings, focus planes or steps, less padding or another propagation need less"
 
 
 def check_room(wanted: int, free: int | None, what: str) -> None:
@@ -20,8 +21,7 @@ def check_room(wanted: int, free: int | None, what: str) -> None:
     """
     if free is not None and wanted > free:
         raise ShortOfMemoryError(
-            f"{what} need at least {wanted / GIB:.3g} GiB of memory, {free / GIB:.3g} GiB are free; fewer voxels, "
-            "prism settings, focus planes or steps, less padding or another propagation need less"
+            f"{what} need at least {wanted / GIB:.3g} GiB of memory, {free / GIB:.3g} GiB are free; {LESS}"
         )
 
 
@@ -34,16 +34,23 @@ def check_volume(grid: Grid, copies: int, device: torch.device) -> None:
 def free_bytes(device: torch.device) -> int | None:
     """Bytes that a device has free for tensors; None if that isn't known.
 
-    On the CPU this is the memory that Linux counts as available, or what the process's control groups leave of their
-    limits if that is less. On CUDA it is what the device has free, and what torch's allocator holds unused.
+    On the CPU this is the memory that Linux counts as available, or what the process's control groups, or its own limit
+    (`ulimit -v`), leave if that is less. On CUDA it is what the device has free, and what torch's allocator holds
+    unused.
     """
     if device.type == "cuda":
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     if device.type != "cpu":
         return None
-    known = [available(), *left_by_groups()]
+    known = [available(), left_by_limit(), *left_by_groups()]
     return min((n for n in known if n is not None), default=None)
+
+
+def spared(memory: int, device: torch.device) -> int:
+    """Bytes of a budget that are there, where as many again are left for what is made of them."""
+    free = free_bytes(device)
+    return memory if free is None else min(memory, free // 2)
 
 
 def available(table: Path = Path("/proc/meminfo")) -> int | None:
@@ -54,6 +61,18 @@ def available(table: Path = Path("/proc/meminfo")) -> int | None:
         return None
     found = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     return found[0] << 10 if found else None
+
+
+def left_by_limit(sizes: Path = Path("/proc/self/statm")) -> int | None:
+    """Bytes that the process's limit on its address space leaves; None without a limit, or where it isn't known."""
+    try:
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        pages = int(sizes.read_text(encoding="ascii").split()[0])
+    except (ImportError, OSError):  # no Unix, no Linux
+        return None
+    return None if limit == resource.RLIM_INFINITY else max(0, limit - pages * resource.getpagesize())
 
 
 def left_by_groups(root: Path = Path("/sys/fs/cgroup"), membership: Path = Path("/proc/self/cgroup")) -> list[int]:

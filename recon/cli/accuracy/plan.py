@@ -14,6 +14,7 @@ from recon.earlier.tikhonov import tikhonov
 from recon.fit.setup import Setup, empty_medium
 from recon.run.data import load_data
 from recon.run.folder.prepared import prepare_folder
+from recon.run.room import check_room_for_direct
 from torchdic import Volume
 from torchdic.files.whole import write_json
 
@@ -52,6 +53,7 @@ def _first_estimate(config: Config, source: str, device: torch.device) -> Volume
     medium = empty_medium(config.volume.grid, config.volume.background, data)
     setup = Setup(medium, config.microscope, config.acquisition)
     try:
+        check_room_for_direct("linear", data, setup, config.reconstruction.bounds)
         found = tikhonov(data, setup, measured.noise, config.reconstruction.bounds)
     except ValueError as error:
         raise ConfigError(f"{source}: no first estimate of the specimen for a plan: {error}") from error

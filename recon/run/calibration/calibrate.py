@@ -54,8 +54,8 @@ def calibrate(
     signs and orders.
     source: of the configuration's file, whose keys and comments calibrated.toml keeps.
     restart: replace what an earlier calibration has left there.
-    Raises ConfigError and StackError for bad input, and FinishedError where the folder has a calibration, before `out`
-    is touched.
+    Raises ConfigError and StackError for bad input, FinishedError where the folder has a calibration, and
+    ShortOfMemoryError where the fits have no room, before `out` is touched.
     """
     check_no_results(out, RESULTS, restart=restart)
     section = config.calibration.bead
@@ -69,6 +69,7 @@ def calibrate(
     if min(sides := stack.data.shape[2:]) < SMALLEST:
         pixels, least = (" × ".join(map(str, v)) for v in (sides, (SMALLEST, SMALLEST)))
         raise ConfigError(f"data.path: images of {pixels} pixels tell nothing of the optics; give {least} or more")
+    stack.check_room(bounds_of(config))
     prepare_folder(out)
     orders = stack.orders(bounds_of(config))
     found = [_of_orders(orders, config)]

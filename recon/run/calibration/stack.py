@@ -18,6 +18,7 @@ from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
 from recon.run.data import camera_pixels, load_data
+from recon.run.room import check_room_for_descent
 from torchdic import Acquisition, Fidelity, Grid, Microscope
 
 # Slices of the volumes by which signs and orders are told, before a round has fewer.
@@ -83,6 +84,14 @@ class CalibrationStack:
         if not can_be_tried(problem_of(config.acquisition, COARSE, recipe)):
             return None
         return find_orders(config.acquisition, problem_of, recipe, self.noise)
+
+    def check_room(self, bounds: Bounds) -> None:
+        """Raise ShortOfMemoryError where the fits of a part would take more memory than is free. bounds: of Δn."""
+        part, recipe = self.part(), Recipe(bounds=bounds, prior=self.config.reconstruction.prior)
+        setup = part.setup(self.config.volume.background, self.microscope, self.config.acquisition)
+        problem = Problem.from_recipe(part.data, setup, Fidelity("wave"), recipe, noise=self.noise)
+        if can_be_tried(problem):
+            check_room_for_descent(problem, GaussianMisfit)
 
     def beside(self, planes: int = PLANES) -> Beside:
         """The part of the stack beside a volume that is fitted to it; the volume goes on where the specimen is cut."""

@@ -1,10 +1,12 @@
 """A folder that results are to be written into."""
 
 import os
+import warnings
 from pathlib import Path
 
 from recon.config.schema import ConfigError
-from recon.run.folder.lock import hold
+from recon.run.checkpoint import UnsavedWarning
+from recon.run.folder.lock import hold, is_lost
 from torchdic.files.whole import written_whole
 
 
@@ -30,3 +32,18 @@ def prepare_folder(out: Path) -> None:
     except OSError as error:
         raise ConfigError(f"{out}: can't be written to: {error.strerror or error}") from error
     hold(out)
+
+
+def keep_folder(out: Path) -> None:
+    """Make the folder of a run anew where it was removed during the run, and warn UnsavedWarning of it.
+
+    Where it can't be made, nothing is said: what is written next will say so. Raises FolderInUseError where another run
+    has made it.
+    """
+    if out.is_dir() and not is_lost(out):
+        return
+    try:
+        prepare_folder(out)
+    except ConfigError:
+        return
+    warnings.warn(f"{out}: the folder was removed during the run; it is made anew", UnsavedWarning, stacklevel=2)

@@ -16,7 +16,7 @@ from recon.run.checkpoint import Checkpoint
 from recon.run.interruption import InterruptedRunError
 from recon.run.recorded import STOPPING, descend_recorded
 from recon.run.results import ResultsError, Tiled, leave_interrupted, model_images
-from recon.run.tiles.kept import begun, folder_of, identity_of, keep, kept
+from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
 from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first
@@ -88,6 +88,14 @@ class TiledFit:
         """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
         return kept(folder_of(self.out, tile), self.identity_of(tile))
 
+    def found(self, tile: Tile) -> Checkpoint:
+        """A tile that has been fitted. Raises as `kept` does, and ResultsError where it is gone."""
+        ended = self.kept(tile)
+        if ended is None:
+            gone = folder_of(self.out, tile) / FITTED
+            raise ResultsError(f"{gone}: was removed during the run; go on with --resume, which fits that tile again")
+        return ended
+
     def identity_of(self, tile: Tile) -> str:
         """What a tile's fit depends on."""
         shared = "" if tile == self.tiles[0] else f"weight {self.shared.weight}, contrast {self.shared.contrast}"
@@ -96,9 +104,8 @@ class TiledFit:
     @cached_property
     def shared(self) -> SharedByTiles:
         """What the first tile, which is fitted, says of all."""
-        first = self.kept(self.tiles[0])
-        assert first is not None
-        return SharedByTiles.by(self.problem(self.tiles[0]), first.step)
+        first = self.tiles[0]
+        return SharedByTiles.by(self.problem(first), self.found(first).step)
 
     def problem(self, tile: Tile) -> Problem:
         """What is to be fitted of a tile."""
@@ -119,18 +126,16 @@ class TiledFit:
         """The fitted tiles, one at a time."""
         for tile in self.tiles:
             found = self.kept(tile)
-            if found is None:
-                return  # those after it aren't fitted either
-            yield tile, found
+            if found is not None:
+                yield tile, found
 
     def together(self) -> Tiled:
         """What the fitted tiles say together."""
         steps, seconds = {}, {}
-        for tile, ended in self.ended():
-            steps[str(tile)], seconds[str(tile)] = ended.step.number, ended.step.seconds
-        first = self.kept(self.tiles[0])
-        assert first is not None
-        delta = self.volume()
+        for tile in self.tiles:
+            last = self.found(tile).step
+            steps[str(tile)], seconds[str(tile)] = last.number, last.seconds
+        first, delta = self.found(self.tiles[0]), self.volume()
         values = {**self.shared.values, IndexDifference.name: delta}
         whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()))
         ended = replace(first, step=whole)
