@@ -255,15 +255,14 @@ def test_a_damaged_file_is_named_and_costs_no_more(results, name, damage):
     assert "How it was made" in text
 
 
-def odd(value):
-    """Values of other kinds than are expected, wherever JSON may hold them."""
-    return [value, None, "word", -1, [], {}, [value], {"a": value}, [[None]], True]
+# Values of other kinds than are expected, as JSON may hold them.
+ODD = (None, "word", [3.0, [None]], [{"a": 3.0}], {"a": [3.0], "specimen": {"a": "word"}})
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "error_bars.json", "coverage.json", "calibration.json", "plan.json"])
 def test_numbers_of_another_version_lose_no_page(results, name):
     keys = [*METRICS, *VERDICT, "regions", "inside_and_near", "point_width_um", "changes", "effects"]
-    for value in odd(3.0):
+    for value in ODD:
         (results / name).write_text(json.dumps(dict.fromkeys(keys, value)), encoding="utf-8")
         assert "Three sections through one point" in text_of(results)
 

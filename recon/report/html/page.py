@@ -18,7 +18,7 @@ from recon.report.html.folder import Folder, table_in, tables_in
 from recon.report.html.headline import RECONSTRUCTION, facts, headline, kind_of
 from recon.report.html.images import Images, images_of
 from recon.report.html.packed import packed
-from recon.report.html.plots import draw_course, draw_spectrum, spectrum
+from recon.report.html.plots import draw_course, draw_spectrum
 from recon.report.html.tables import runs, tables
 from recon.report.html.volumes import volumes_of
 from recon.report.html.words import is_number, short
@@ -146,13 +146,12 @@ def page(folder: Folder, kind: tuple[str, str]) -> str:
 
 def _spectrum(images: Images, metrics: dict[str, Any], config: dict[str, Any]) -> Markup | None:
     """The residual's spectrum, where there are models: over the noise's power if that is known, else over its mean."""
-    if images.residual is None or images.pixel is None or min(images.residual.shape[2:]) < 8:
+    if not images.spectra:
         return None
     noises = [noise for one in tables_in(metrics, "prisms") if is_number(noise := one.get("noise")) and noise > 0]
-    known = len(noises) == len(images.residual)
+    known = len(noises) == len(images.spectra)
     lines = []
-    for number, residual in enumerate(images.residual):
-        frequency, power = spectrum(residual, images.pixel)
+    for number, (frequency, power) in enumerate(images.spectra):
         level = noises[number] ** 2 if known else float(power.mean()) or 1.0
         lines.append((f"prism {number + 1}", frequency, power / level))
     unit = "power of the residual ÷ noise" if known else "power of the residual ÷ its mean"

@@ -18,6 +18,9 @@ _INK = "#010203"
 # Okabe and Ito's colours, which the colour-blind tell apart, and dashes that tell them without colour.
 LINES = (("#0072b2", "-"), ("#d55e00", "--"), ("#009e73", "-."), ("#cc79a7", ":"), ("#e69f00", "-"), ("#56b4e9", "--"))
 
+# Frequencies in 1/µm, and the power at each.
+Spectrum = tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]
+
 # Rings of frequencies over which a spectrum is averaged.
 RINGS = 32
 
@@ -49,9 +52,7 @@ def draw_spectrum(spectra: Sequence[tuple[str, np.ndarray, np.ndarray]], limit: 
     return as_svg(figure, "spectrum")
 
 
-def spectrum(
-    images: Float[np.ndarray, "focus y x"], pixel: tuple[float, float]
-) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
+def spectrum(images: Float[np.ndarray, "focus y x"], pixel: tuple[float, float]) -> Spectrum:
     """The mean power of images, each less its mean, over rings of frequency (1/µm); white noise of variance v has v.
 
     pixel: its size (y, x) in µm.
