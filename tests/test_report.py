@@ -3,6 +3,7 @@
 import base64
 import errno
 import json
+import os
 import re
 import zlib
 from itertools import pairwise
@@ -113,7 +114,7 @@ def test_thinned_volumes_are_within_what_is_allowed_and_no_coarser_than_need_be(
 
 def test_a_few_voxels_that_stand_out_do_not_decide_the_scale():
     values = np.full((20, 40, 40), 0.02)
-    values[0, 0, :3] = 0.5
+    values[0, 0, :5] = 0.5
     assert reach(values) == (0.0, 0.02)
     assert reach(-values) == (-0.02, 0.0)
     lonely = np.zeros((20, 40, 40))
@@ -267,6 +268,19 @@ def test_numbers_of_another_version_lose_no_page(results, name):
         assert "Three sections through one point" in text_of(results)
 
 
+def test_error_bars_of_an_earlier_volume_are_said_to_be(results):
+    write_volume(results / "sd.ome.tif", volume() / 10, GRID)
+    numbers = {"volume_um3": {"value": 142.1, "error": 5.3}}
+    (results / "error_bars.json").write_text(json.dumps({"regions": {"specimen": numbers}}), encoding="utf-8")
+    assert text_of(results).count("142.1 ± 5.3") == 2  # among the first numbers, and in the table
+    for name in ("sd.ome.tif", "error_bars.json"):
+        os.utime(results / name, (1, 1))
+    text = text_of(results)
+    assert "Error bars of an earlier volume" in text
+    assert "± by noise (of an earlier volume)" in text
+    assert text.count("142.1 ± 5.3") == 1
+
+
 def test_text_of_the_users_is_text_on_the_page(results):
     wicked = "</script></pre><script>alert(1)</script>"
     (results / "config.resolved.toml").write_text(f'note = "{wicked}"', encoding="utf-8")
@@ -344,14 +358,16 @@ def test_a_report_without_room_costs_itself_alone(bead, monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_page_of_the_users_stays(bead, capsys):
+def test_files_of_the_users_stay(bead, capsys):
     (bead / "made").mkdir()
     (bead / "made" / "report.html").write_text("<p>my own</p>")
+    (bead / "made" / "run.json").write_text('{"mine": 1}')
     assert main(["simulate", "bead.toml", "--out", "made"]) == 0
     assert "made/report.html: isn't torchdic's" in capsys.readouterr().err
     assert main(["report", "made"]) == 2
     assert "move it away" in capsys.readouterr().err
     assert (bead / "made" / "report.html").read_text() == "<p>my own</p>"
+    assert (bead / "made" / "run.json").read_text() == '{"mine": 1}'
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchdic import Grid
-from torchdic.errors import StackError
 from torchdic.files.format import Stack
 from torchdic.files.stack import read_stack, read_volume
 
@@ -82,7 +81,11 @@ class Folder:
             return None
         try:
             return read(self.path / name)
-        except (OSError, ValueError, StackError) as error:  # what isn't text, JSON or TOML raises a ValueError
+        except (
+            OSError,
+            ValueError,
+            MemoryError,
+        ) as error:  # what isn't text, JSON, TOML or a stack raises a ValueError
             line = (str(error).splitlines() or [type(error).__name__])[0]
             self.damaged.append(f"{name}: {line.removeprefix(f'{self.path / name}: ')}")
             return None

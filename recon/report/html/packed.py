@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped
 LEVELS = 255
 
 # The part of a volume's values at either end that scales leave out: a few voxels that stand out don't decide them.
-BEYOND = 5e-4
+BEYOND = 2e-4
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from recon.report.html.words import is_number, short
 from torchdic import __version__
 from torchdic.files.whole import write_text
 
-REPORT = "report.html"
+REPORT, BARS = "report.html", "error_bars.json"
 
 # In a page's head it says who made it; in a page without it nothing is replaced.
 _MADE = '<meta name="generator" content="torchdic'
@@ -62,7 +62,7 @@ WANTED = {
     "run.json": "command, time, memory and versions",
     "calibration.json": "what the images tell of the microscope: torchdic calibrate, into a folder of its own",
     "coverage.json": "which structures the images show: torchdic coverage, into a folder of its own",
-    "error_bars.json": "error bars: torchdic error-bars finds them",
+    BARS: "error bars: torchdic error-bars finds them",
 }
 
 
@@ -98,7 +98,8 @@ def _is_ours(path: Path) -> bool:
 
 def page(folder: Folder, kind: tuple[str, str]) -> str:
     """The page of a folder, as HTML. kind: of its run, as of `kind_of`."""
-    metrics, config, bars = (folder.table(name) for name in ("metrics.json", "config.resolved.toml", "error_bars.json"))
+    metrics, config, bars = (folder.table(name) for name in ("metrics.json", "config.resolved.toml", BARS))
+    earlier = folder.is_older(BARS, "volume.ome.tif")
     volumes = volumes_of(folder)
     images = images_of(folder, table_in(config, "acquisition"))
     rows = folder.rows("log.csv")
@@ -116,14 +117,14 @@ def page(folder: Folder, kind: tuple[str, str]) -> str:
         "kind": kind[0],
         "judged": kind[0] == RECONSTRUCTION,
         "headline": headline(kind, metrics),
-        "facts": facts(metrics, config, bars, volumes, images),
+        "facts": facts(metrics, config, {} if earlier else bars, volumes, images),
         "volumes": volumes,
         "images": images,
         "course": Markup(draw_course(rows, noise)) if rows else None,
         "rows": rows,
         "noise": noise,
         "spectrum": None if images is None else _spectrum(images, metrics, config),
-        "tables": tables(folder, metrics, bars),
+        "tables": tables(folder, metrics, bars, earlier=earlier),
         "runs": runs(folder),
         "pictures": tuple(_pictures(folder, {**PICTURES, **shown_alone})),
         "still": tuple(_pictures(folder, instead)),

@@ -25,14 +25,14 @@ class Table:
     note: str = ""
 
 
-def tables(folder: Folder, metrics: dict[str, Any], bars: dict[str, Any]) -> tuple[Table, ...]:
+def tables(folder: Folder, metrics: dict[str, Any], bars: dict[str, Any], *, earlier: bool) -> tuple[Table, ...]:
     """All tables that a folder's files fill, but those of its runs.
 
-    metrics, bars: of metrics.json and error_bars.json.
+    metrics, bars: of metrics.json and error_bars.json. earlier: whether the bars are those of an earlier volume.
     """
     made = (
         _comparison(folder.records("comparison.json")),
-        _regions(bars),
+        _regions(bars, earlier),
         _calibration(folder.table("calibration.json")),
         _coverage(folder.table("coverage.json")),
         _changes(folder.table("coverage.json")),
@@ -84,7 +84,7 @@ def _comparison(scores: list[dict[str, Any]]) -> Table:
     return Table("Comparison with the truth", head, rows, note)
 
 
-def _regions(bars: dict[str, Any]) -> Table:
+def _regions(bars: dict[str, Any], earlier: bool) -> Table:
     regions = table_in(bars, "regions")
     numbers = {name: table_in(regions, name) for name in regions}
     rows = tuple(
@@ -97,7 +97,12 @@ def _regions(bars: dict[str, Any]) -> Table:
         f"± 1 standard deviation. Δn inside and near the specimen is known to ± {whole}: noise makes ± {noise} "
         f"and what is lost ± {lost}. What the images don't show at all, and what is wrong with the model, is in no bar."
     )
-    return Table("Error bars", ("Part", "Volume, µm³", "Mean index", "Dry mass, pg"), rows, note)
+    return Table(
+        "Error bars of an earlier volume" if earlier else "Error bars",
+        ("Part", "Volume, µm³", "Mean index", "Dry mass, pg"),
+        rows,
+        note,
+    )
 
 
 def _known(value: Mapping[str, Any]) -> str:

@@ -18,19 +18,24 @@ MOST_VOXELS = 2_500_000
 
 @dataclass(frozen=True)
 class Kind:
-    """A file that holds a volume. file: its name. title, unit: of what it holds. colours: the map's name."""
+    """A file that holds a volume.
+
+    file: its name. title, unit: of what it holds. colours: the map's name. about: the file of the volume whose errors
+    it holds; empty where it holds none.
+    """
 
     file: str
     title: str
     unit: str = ""
     colours: str = "viridis"
+    about: str = ""
 
 
 # A finished volume comes before one of a later run that was interrupted.
 KINDS = (
     Kind("volume.ome.tif", "Δn"),
-    Kind("sd.ome.tif", "± by noise", colours="magma"),
-    Kind("error.ome.tif", "± in all", colours="magma"),
+    Kind("sd.ome.tif", "± by noise", colours="magma", about="volume.ome.tif"),
+    Kind("error.ome.tif", "± in all", colours="magma", about="volume.ome.tif"),
     Kind("opl.ome.tif", "Optical path", "µm"),
     Kind("wave.ome.tif", "Δn by the wave"),
     Kind("rays.ome.tif", "Δn by bent rays"),
@@ -43,8 +48,9 @@ KINDS = (
 class Volumes:
     """The volumes of a folder.
 
-    shown: each as the page's script takes it. surfaces: of the first, None where it has none. grid: of the first.
-    low, high: the least and the greatest Δn in it. thinned: what is left out for viewing, in words; empty for nothing.
+    shown: each as the page's script takes it. surfaces: of the first, None where it isn't of Δn, or has none. grid: of
+    the first. low, high: the least and the greatest value in it. thinned: what is left out for viewing, in words; empty
+    for nothing.
     """
 
     shown: tuple[dict[str, Any], ...]
@@ -69,7 +75,8 @@ def volumes_of(folder: Folder) -> Volumes | None:
         thinning = Thinning.within(MOST_VOXELS // len(kinds), grid.shape, grid.spacing)
         shown.append(_shown(kind, values, grid, thinning, folder))
         if first is None:
-            first = grid, float(values.min()) + 0.0, float(values.max()) + 0.0, surfaces(values, grid), thinning
+            surface = surfaces(values, grid) if kind.title.startswith("Δn") else None
+            first = grid, float(values.min()), float(values.max()), surface, thinning
     if first is None:
         return None
     grid, low, high, surface, thinning = first
@@ -86,7 +93,7 @@ def _shown(kind: Kind, values: np.ndarray, grid: Grid, thinning: Thinning, folde
     thin = thinning.of(values)
     low, high = min(0.0, float(thin.min())), max(0.0, float(thin.max()))
     levels = in_levels(np.array(reach(thin)), low, high)
-    old = folder.is_older(kind.file, KINDS[0].file) and kind.colours == "magma"
+    old = bool(kind.about) and folder.is_older(kind.file, kind.about)
     return {
         "title": f"{kind.title} (of an earlier volume)" if old else kind.title,
         "unit": kind.unit,

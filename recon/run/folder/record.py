@@ -30,10 +30,13 @@ class Record:
     def leave(self, out: Path, command: str, typed: str, device: torch.device | None) -> None:
         """Write what the command has taken into a folder, in place of what an earlier one of its name took.
 
+        A file of that name that isn't torchdic's stays as it is.
         command: its name. typed: as a shell takes it. device: on which it computed; None for the CPU.
         Raises WriteError.
         """
-        write_json(out / RECORD, {**_earlier(out / RECORD), command: self._taken(typed, device or torch.device("cpu"))})
+        earlier = _earlier(out / RECORD)
+        if earlier is not None:
+            write_json(out / RECORD, {**earlier, command: self._taken(typed, device or torch.device("cpu"))})
 
     def _taken(self, typed: str, device: torch.device) -> dict[str, Any]:
         on_gpu = device.type == "cuda"
@@ -54,13 +57,16 @@ class Record:
         }
 
 
-def _earlier(path: Path) -> dict[str, Any]:
-    """The records of other commands that are there; none where they can't be read."""
+def _earlier(path: Path) -> dict[str, Any] | None:
+    """The records of commands that are there; None where the file isn't of such."""
+    if not path.exists():
+        return {}
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
+        return None
+    ours = isinstance(found, dict) and all(isinstance(one, dict) and "command" in one for one in found.values())
+    return found if ours else None
 
 
 def _peak() -> int | None:

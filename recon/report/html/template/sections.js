@@ -59,8 +59,8 @@
   function drawScale() {
     const low = Number(from.value), high = Number(to.value);
     report.draw(element("sections-scale"), 1, 256, (row, column) => Math.round(low + (column / 255) * (high - low)), colours());
-    element("scale-low").textContent = short(valueOf(low)) + unit();
-    element("scale-high").textContent = short(valueOf(high)) + unit();
+    element("scale-low").textContent = (low > 0 ? "≤ " : "") + short(valueOf(low)) + unit();
+    element("scale-high").textContent = (high < 255 ? "≥ " : "") + short(valueOf(high)) + unit();
     element("scale-name").textContent = volume().title;
     for (const [slider, level] of [[from, low], [to, high]]) {
       const words = short(valueOf(level)) + unit();
