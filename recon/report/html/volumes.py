@@ -8,7 +8,7 @@ import torch
 
 from recon.report.figures import centre
 from recon.report.html.folder import Folder
-from recon.report.html.packed import Thinning, in_levels, packed, reach
+from recon.report.html.packed import LEVELS, Thinning, in_levels, packed, reach
 from recon.report.html.surface import Surfaces, surfaces
 from torchdic import Grid
 
@@ -92,7 +92,7 @@ def _shown(kind: Kind, values: np.ndarray, grid: Grid, thinning: Thinning, folde
     """A volume as the page's script takes it."""
     thin = thinning.of(values)
     low, high = min(0.0, float(thin.min())), max(0.0, float(thin.max()))
-    levels = in_levels(np.array(reach(thin)), low, high)
+    scale = in_levels(np.array(reach(thin)), low, high).tolist() if high > low else [0, LEVELS]
     old = bool(kind.about) and folder.is_older(kind.file, kind.about)
     return {
         "title": f"{kind.title} (of an earlier volume)" if old else kind.title,
@@ -104,6 +104,6 @@ def _shown(kind: Kind, values: np.ndarray, grid: Grid, thinning: Thinning, folde
         "begin": [int(place) for place in centre(torch.from_numpy(thin))],
         "low": low,
         "high": high,
-        "scale": levels.tolist(),
+        "scale": scale,
         "values": packed(in_levels(thin, low, high)),
     }
