@@ -22,6 +22,14 @@ PIXELS = """canvas => {
   return [canvas.height, canvas.width, ...data];
 }"""
 
+# As PIXELS, of a picture.
+DRAWN = """picture => {
+  const canvas = document.createElement('canvas');
+  [canvas.width, canvas.height] = [picture.naturalWidth, picture.naturalHeight];
+  const context = canvas.getContext('2d');
+  context.drawImage(picture, 0, 0);
+  return [canvas.height, canvas.width, ...context.getImageData(0, 0, canvas.width, canvas.height).data];
+}"""
 FOCUSED = """() => {
   const found = document.activeElement;
   return [found.id || found.dataset.turn || found.tagName, getComputedStyle(found).outlineStyle];
@@ -253,5 +261,13 @@ def test_the_surface_is_drawn_and_turned_by_keys(opened):
     page.keyboard.press("Enter")
     turned = page.evaluate("document.getElementById('solid').layout.scene.camera.eye")
     assert np.arctan2(turned["y"], turned["x"]) - np.arctan2(eye["y"], eye["x"]) == pytest.approx(np.pi / 12)
-    shades = page.locator("#solid").screenshot()
-    assert len(shades) > 5000  # an empty scene packs to less
+    picture = page.locator("#on-paper")
+    page.wait_for_selector("#on-paper[src]", state="attached")
+    assert not picture.is_visible()
+    page.emulate_media(media="print")
+    assert picture.is_visible()
+    assert not page.locator("#solid").is_visible()
+    height, width, *values = picture.evaluate(DRAWN)
+    shades = np.array(values).reshape(height, width, 4)[..., :3].astype(int)
+    green = (shades[..., 1] > shades[..., 0] + 30) & (shades[..., 1] > shades[..., 2] + 10)
+    assert green.sum() > 1000  # the surface itself, not only its frame

@@ -53,9 +53,10 @@
     return made;
   }
 
-  function layout() {
-    const style = getComputedStyle(document.documentElement);
-    const [ink, line] = ["--ink", "--line"].map((name) => style.getPropertyValue(name).trim());
+  const style = getComputedStyle(document.documentElement);
+  const colour = (name) => style.getPropertyValue(name).trim();
+
+  function layout(ink = colour("--ink"), line = colour("--line")) {
     const axis = (name, n, upside) => ({
       title: { text: `${name} (µm)` }, color: ink, gridcolor: line, zeroline: false, showspikes: false, showbackground: false,
       // y grows downward in images, and light travels toward +z
@@ -72,10 +73,26 @@
     };
   }
 
-  function draw() {
+  function shown() {
     const chosen = Number(slider.value);
     const veil = chosen > 0 ? meshes[0].map((mesh) => ({ ...mesh, opacity: VEIL })) : [];
-    Plotly.react(scene, [...meshes[chosen], ...veil], layout(), { displaylogo: false, displayModeBar: false, scrollZoom: false, responsive: true });
+    return [...meshes[chosen], ...veil];
+  }
+
+  // paper takes a picture, in dark letters: browsers don't print what a GPU has drawn
+  let later = 0;
+  function picture() {
+    clearTimeout(later);
+    later = setTimeout(async () => {
+      const size = { width: scene.clientWidth, height: scene.clientHeight };
+      if (!size.width) return; // being printed
+      element("on-paper").src = await Plotly.toImage({ data: shown(), layout: layout("#222", "#ccc") }, { format: "png", ...size });
+    }, 1000);
+  }
+
+  function draw() {
+    picture();
+    Plotly.react(scene, shown(), layout(), { displaylogo: false, displayModeBar: false, scrollZoom: false, responsive: true });
   }
 
   async function begin() {
@@ -92,7 +109,10 @@
       meshes = await traces();
       scene.textContent = "";
       draw();
-      scene.on("plotly_relayout", () => (eye = scene.layout.scene.camera.eye));
+      scene.on("plotly_relayout", () => {
+        eye = scene.layout.scene.camera.eye;
+        picture();
+      });
       scene.dataset.drawn = "yes";
     } catch (error) {
       message(`The view in three dimensions can't be shown here (${error.message}). The sections above show the same volume.`);
