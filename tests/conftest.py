@@ -149,6 +149,14 @@ def no_pictures(monkeypatch):
     monkeypatch.setattr("recon.report.figures.save", lambda _figure, path: path.touch())
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_reports():
+    """Commands leave an empty report.html; tests/test_report.py makes true ones, which take most of a second each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("recon.cli.running.leave_report", lambda out: (out / "report.html").touch())
+        yield
+
+
 @pytest.fixture(scope="session")
 def measured_file():
     """A function from a name to the measured file; the test skips where it is absent."""

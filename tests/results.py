@@ -1,5 +1,8 @@
 """What a reconstruction leaves in its folder."""
 
+# What the command line leaves beside the results, once all of them are written.
+BESIDE = {"report.html", "run.json", "README.txt"}
+
 RESULTS = {
     "volume.ome.tif",
     "metrics.json",
@@ -10,5 +13,5 @@ RESULTS = {
     "sections.png",
     "misfit.png",
     "checkpoint.pt",
-    "README.txt",
+    *BESIDE,
 }

@@ -7,6 +7,7 @@ import pytest
 import tifffile
 import tomli_w
 import torch
+from results import BESIDE
 
 from data_synthetic import GaussianBall
 from recon.cli import main
@@ -30,7 +31,7 @@ CONFIG = {
     "data": {"path": "stack.ome.tif"},
 }
 RESULTS = {"volume.ome.tif", "images.ome.tif", "images.png", "sections.png"}
-RESULTS |= {"metrics.json", "config.resolved.toml", "README.txt"}
+RESULTS |= {"metrics.json", "config.resolved.toml", *BESIDE}
 METHODS = pytest.mark.parametrize("method", ["linear", "opl"])
 OPL_SLOW = pytest.mark.parametrize("method", ["linear", pytest.param("opl", marks=pytest.mark.slow)])
 

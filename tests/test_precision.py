@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from results import BESIDE
 
 from data_synthetic import Bead, GaussianBall
 from recon.cli import main
@@ -447,7 +448,7 @@ def test_command_leaves_csv_json_and_a_figure(run, tmp_path):
     code, _ = run(CONFIG)
     assert code == 0
     out = tmp_path / "out"
-    left = [*(f"work_precision.{kind}" for kind in ("csv", "json", "png")), "config.resolved.toml", "README.txt"]
+    left = [*(f"work_precision.{kind}" for kind in ("csv", "json", "png")), "config.resolved.toml", *BESIDE]
     assert {path.name for path in out.iterdir()} == set(left)
     found = json.loads((out / "work_precision.json").read_text(encoding="utf-8"))
     straight, best = (converter.structure(trial, Trial) for trial in found["trials"])

@@ -20,7 +20,7 @@ import tomli_w
 import torch
 from absolute import Absolute
 from matplotlib import image as pictures
-from results import RESULTS
+from results import BESIDE, RESULTS
 
 from data_synthetic import GaussianBall
 from recon.cli import main
@@ -118,7 +118,7 @@ def other(workplace, tmp_path):
 
 
 def test_simulate_leaves_a_stack_and_its_picture(workplace):
-    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png", "config.resolved.toml", "README.txt"}
+    assert set(content(workplace / "simulated")) == {"stack.ome.tif", "stack.png", "config.resolved.toml", *BESIDE}
     assert pictures.imread(workplace / "simulated" / "stack.png").std() > 0
 
 

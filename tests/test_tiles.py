@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from results import BESIDE
 from test_reconstruct import command, content, interrupt_at, volume
 
 from recon.config.reading import load
@@ -329,7 +330,7 @@ def test_a_run_by_tiles_leaves_what_any_run_leaves(workplace):
     out = workplace / "whole"
     assert set(content(out)) == {
         "volume.ome.tif", "metrics.json", "config.resolved.toml", "images.ome.tif", "images.png", "sections.png",
-        "misfit.png", "README.txt",
+        "misfit.png", *BESIDE,
     }  # fmt: skip
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics["tiles"]["steps"]) == {"1-1", "1-2"}

@@ -6,6 +6,7 @@ Nothing here imports torch, which takes seconds: help is there at once, and a co
 import argparse
 import difflib
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -27,7 +28,7 @@ class Command:
 
     module: has its function `run`. help: in one line. example: how it is typed, without `torchdic`. shared: arguments
     that other commands have too. own: whether its module has further `arguments`, which stand before the shared ones.
-    aliases: its other names.
+    aliases: its other names. reported: whether a folder of its results tells of the command and gets a report.html.
     """
 
     module: str
@@ -36,6 +37,7 @@ class Command:
     shared: tuple[Callable[[argparse.ArgumentParser], None], ...]
     own: bool = False
     aliases: tuple[str, ...] = ()
+    reported: bool = True
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add all of its arguments to its parser."""
@@ -122,6 +124,15 @@ COMMANDS = {
         "view run_volume",
         (),
         own=True,
+        reported=False,
+    ),
+    "report": Command(
+        "recon.cli.evidence.report",
+        "make the page that shows a folder's results, report.html, again",
+        "report run_volume",
+        (),
+        own=True,
+        reported=False,
     ),
     "work-precision": Command(
         "recon.cli.accuracy.work_precision",
@@ -147,7 +158,9 @@ def main(typed: Sequence[str] | None = None) -> int:
     """
     write_plainly()
     words = list(sys.argv[1:] if typed is None else typed)
-    chosen = next((row for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), None)
+    name, chosen = next(
+        ((name, row) for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), ("", None)
+    )
     with interrupted_at_once():
         parser = _parser(chosen)
         if chosen is None:
@@ -155,6 +168,7 @@ def main(typed: Sequence[str] | None = None) -> int:
         options = parser.parse_args(arguments.repeated(words, chosen.several if chosen else ()))
         assert chosen is not None  # the parser has shown the help or the version else, and ended the program
         arguments.choose_out(options, parser)
+        options.command, options.typed, options.reported = name, shlex.join(["torchdic", *words]), chosen.reported
         from recon.cli.running import run
 
         command = import_module(chosen.module).run

@@ -6,6 +6,8 @@ import math
 import torch
 
 from data_synthetic import Bead
+from recon.config.resolved import leave_resolved
+from recon.config.schema import Config, VolumeSection
 from recon.fit.problem import Recipe
 from recon.report import figures
 from recon.report.comparison import Truth, compare, table
@@ -42,6 +44,9 @@ def run(options: argparse.Namespace) -> None:
     data = exact_images(BEAD, GRID, MICROSCOPE, ACQUISITION, Fidelity(sources=150)).float()
     pixel = GRID.spacing[1:]
     write_stack(options.out / "stack.ome.tif", data, pixel, 1.0)
+    leave_resolved(
+        Config(VolumeSection(GRID.shape, GRID.spacing, BEAD.background), MICROSCOPE, ACQUISITION), options.out
+    )
     figures.save(figures.draw_stack(data, ACQUISITION.prisms, ACQUISITION.focus, pixel), options.out / "stack.png")
     delta = BEAD.delta(GRID, dtype=torch.float32)
     truth = Truth(GRID, delta, BEAD.background, inside=delta > 0.99 * BEAD.contrast)

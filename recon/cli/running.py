@@ -4,6 +4,7 @@ import argparse
 import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -11,9 +12,11 @@ from tqdm import tqdm
 from recon.cli.doctor.selftest import SelfTestError
 from recon.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
+from recon.report.html.page import ForeignReportError, leave_report
 from recon.run.checkpoint import CheckpointError, UnsavedWarning
 from recon.run.folder.index import leave_index
 from recon.run.folder.lock import FolderInUseError, folders_released, hold
+from recon.run.folder.record import Record
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
@@ -23,18 +26,33 @@ from torchdic.files.whole import WriteError
 from torchdic.memory.shortage import as_shortage, is_shortage
 
 # What the user can put right, in one line that says what.
-WRONG = (ConfigError, StackError, CheckpointError, FinishedError, FolderInUseError, ResultsError, WriteError)
+WRONG = (
+    ConfigError,
+    StackError,
+    CheckpointError,
+    FinishedError,
+    FolderInUseError,
+    ForeignReportError,
+    ResultsError,
+    WriteError,
+)
+
+
+class NoReportError(ResultsError):
+    """Results are there, but the page that shows them can't be written: one line with the reason."""
 
 
 def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespace) -> int:
     """Run a command with the user's options; returns the exit code, see `recon.cli.commands.main`."""
     _show_each_warning_once()
+    record = Record()
     try:
         with folders_released():
             _hold_folder(options)
             try:
                 command(options)
-            except InterruptedRunError:
+                _leave_report(options, record)
+            except (InterruptedRunError, NoReportError):
                 _leave_index(options)
                 raise
             _leave_index(options)
@@ -68,10 +86,33 @@ def _hold_folder(options: argparse.Namespace) -> None:
         hold(out)
 
 
+def _folder(options: argparse.Namespace) -> Path | None:
+    """The folder of the results, where there is one."""
+    out = getattr(options, "out", None) or getattr(options, "folder", None)
+    return out if out is not None and out.is_dir() else None
+
+
+def _leave_report(options: argparse.Namespace, record: Record) -> None:
+    """Leave beside the results how they were made and the page that shows them. Raises NoReportError."""
+    out = _folder(options)
+    if out is None or not options.reported:
+        return
+    try:
+        record.leave(out, options.command, options.typed, getattr(options, "device", None))
+    except WriteError as error:  # the results are there
+        warnings.warn(str(error), UnsavedWarning, stacklevel=2)
+    try:
+        leave_report(out)
+    except ForeignReportError as error:
+        warnings.warn(str(error), UnsavedWarning, stacklevel=2)
+    except WriteError as error:
+        raise NoReportError(f"{error}; make room, and torchdic report {out} makes it") from error
+
+
 def _leave_index(options: argparse.Namespace) -> None:
     """Say in the folder of the results what each file is."""
-    out = getattr(options, "out", None) or getattr(options, "folder", None)
-    if out is None or not out.is_dir():
+    out = _folder(options)
+    if out is None:
         return
     try:
         leave_index(out)

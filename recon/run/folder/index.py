@@ -9,6 +9,7 @@ INDEX = "README.txt"
 
 # What each file is, by its name, in the order in which one looks at them.
 FILES = {
+    "report.html": "all results on one page: the verdict, sections, images, numbers; opens in a browser",
     "volume.ome.tif": "Δn (z, y, x), the index above the medium's, at its scale in µm: see it by torchdic view",
     "sections.png": "sections through the volume along z, y and x",
     "images.png": "measured and modelled images, and what the model leaves of them",
@@ -47,6 +48,7 @@ FILES = {
     "fits.png": "error of reconstructions against seconds",
     "fits.json": "each reconstruction that was tried",
     "fits.csv": "the same as a table",
+    "run.json": "what was typed, the time and memory that it took, and versions",
     "config.resolved.toml": "the configuration with every key, as it was used",
 }
 
