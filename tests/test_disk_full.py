@@ -128,7 +128,7 @@ def test_a_picture_for_which_no_memory_is_left_is_named_and_the_others_are_kept(
     assert code == 2
     assert "images.png: cannot be written: the memory ran out: another 7.5 GiB were asked for" in told[-1]
     assert told[-1].endswith("go on with --resume, from step 2")
-    assert left == RESULTS - {"images.png", "README.txt"}
+    assert left == RESULTS - {"images.png", *BESIDE}
 
 
 def test_a_run_whose_results_had_no_room_goes_on_to_write_them(run, monkeypatch, full, tmp_path):

@@ -345,7 +345,7 @@ def test_an_interrupted_run_by_tiles_goes_on_where_it_was(workplace, tmp_path, m
     which, number = at
     interrupt_in_tile(monkeypatch, 0 if which == "first" else 1, number)
     code, err = command("reconstruct", path, "--out", out)
-    assert code == 130
+    assert code == 130, err
     assert f"interrupted after step {number - 1} of 4; go on with --resume; volume.ome.tif holds Δn so far: " in err
     assert f"{0 if which == 'first' else 1} of 2 tiles, and this one as it is" in err
     assert volume(out).shape == (3, 22, 40)

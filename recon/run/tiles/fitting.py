@@ -128,6 +128,8 @@ class TiledFit:
             found = self.kept(tile)
             if found is not None:
                 yield tile, found
+            elif tile == self.tiles[0]:
+                return  # the others are fitted after it
 
     def together(self) -> Tiled:
         """What the fitted tiles say together."""

@@ -59,11 +59,12 @@ def cut_of(
     remembered = remembered_side(out)
     if remembered is not None:
         return Cut(_layout(problem, remembered[0], margin), remembered[1])
-    small = isinstance(tiles, int) and tiles < max(problem.setup.field.shape[1:])
+    longest = max(problem.setup.field.shape[1:])
+    small = isinstance(tiles, int) and tiles < longest
     try:
         check_room_for_descent(problem, misfit)
     except ShortOfMemoryError:
-        if not small and tiles != "auto":
+        if not small and (tiles != "auto" or least_side(margin) >= longest):
             raise
         side, memory = _with_room(problem, misfit, margin, budget, tiles if isinstance(tiles, int) else None)
         return Cut(_layout(problem, side, margin), memory)
