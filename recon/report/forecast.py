@@ -45,6 +45,11 @@ class Forecast:
         self._last: deque[tuple[float, float]] = deque(maxlen=LAST)
         self._of_kind: dict[float, deque[float]] = {}
 
+    @property
+    def untried(self) -> bool:
+        """Whether nothing has been timed yet."""
+        return self._trial is None and not self._last
+
     def cost(self, number: int) -> float:
         """What a step costs, in the work of its images. number: counted from 0."""
         return self._costs[number]
@@ -60,7 +65,7 @@ class Forecast:
 
         The first call makes the trial. number: steps so far. Raises as the images of a step do.
         """
-        if self._trial is None and not self._last and (first := _first(self._problem)) is not None:
+        if self.untried and (first := _first(self._problem)) is not None:
             self._trial = _trial(self._problem, first) / (WITH_GRADIENT * work(first, *_scene(self._problem)))
         usual = USUAL_STEPS if self._problem.method == "newton" else len(self._costs)
         rate = self._rate()

@@ -21,13 +21,14 @@ from recon.fit.step import Step
 from recon.misfit.base import Misfit
 from recon.recording.cut_field import needed_margin
 from recon.recording.preparation import Measured
+from recon.report.forecast import Forecast
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data, load_support, looks, warn_of_changes
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
-from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped
+from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped, tell_foreseen
 from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import (
     check_room_for_descent,
@@ -90,7 +91,10 @@ def reconstruct(
         result = _in_tiles(config, measured, problem, cut, out, identity)
         warn_of_changes(config, before)
         return result
-    ended = descend_recorded(problem, out, config.reconstruction.checkpoint_every, identity, start)
+    forecast = Forecast(problem)
+    tell_foreseen(problem, forecast, 0 if start is None else start.step.number)
+    every = config.reconstruction.checkpoint_every
+    ended = descend_recorded(problem, out, every, identity, start, forecast=forecast)
     warn_of_changes(config, before)
     save_if_possible(out / CHECKPOINT, ended)
     try:
@@ -124,6 +128,8 @@ def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out:
     """The results of a fit by tiles, which are removed once those are written."""
     problem, layout = cut.problem(whole), cut.layout
     remember_side(out, layout.side, cut.memory)
+    sides = f"{layout.along_y.count} × {layout.along_x.count} voxels"
+    print(f"{len(layout)} tiles of {sides} and {layout.margin} more on each side (tiles = {layout.side})")
     tiled = TiledFit(problem, layout, measured.noise, out, identity, config.reconstruction.checkpoint_every).fitted()
     config = replace(config, reconstruction=replace(config.reconstruction, tiles=layout.side))
     try:

@@ -28,25 +28,24 @@ LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 # What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's is the last).
 STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
 
-
 # Seconds from which on it is worth some more to foresee the memory, too.
 LONG = 60.0
 
 
-def tell_foreseen(problem: Problem, forecast: Forecast, number: int) -> None:
-    """Print what the rest of a descent will take; nothing where its fidelity has yet to be planned.
+def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, tiles: int = 1) -> None:
+    """Print what a descent will take, after a trial; nothing where its fidelity has yet to be planned.
 
-    number: steps so far.
+    number: steps so far. tiles: descents like this one. Raises as the images of a step do.
     """
     seconds = forecast.whole(number)
     if seconds is None:
         return
-    words = f"foreseen: {spoken(seconds)}"
-    if seconds > LONG:
+    words = f"foreseen: {spoken(tiles * seconds)}{f' for {tiles} tiles' if tiles > 1 else ''}"
+    if tiles * seconds > LONG:
         words += f" and {bytes_of_descent(problem, GaussianMisfit) / GIB:.2g} GiB"
     if problem.method == "newton" and problem.steps > USUAL_STEPS:
-        words += f", if it ends after {USUAL_STEPS} of {problem.steps} steps, as is usual"
-    tqdm.write(words)
+        words += f", if descents end after {USUAL_STEPS} of {problem.steps} steps, as is usual"
+    print(words)
 
 
 # Leaves the volume of a step at which a descent was stopped, and says in words where. Raises StackError.
@@ -60,12 +59,14 @@ def descend_recorded(
     identity: str,
     start: Checkpoint | None = None,
     leave: Leave | None = None,
+    forecast: Forecast | None = None,
 ) -> Checkpoint:
     """Take the steps of a problem, with a progress bar; returns the last one, with all rows of the log.
 
     out: folder of the log and the checkpoint. checkpoint_every: steps between checkpoints. identity: what the descent
     depends on, for the checkpoint. start: to go on from. leave: leaves the volume where the descent is stopped; None
-    leaves it in the folder. A folder that is removed on the way is made anew.
+    leaves it in the folder. forecast: of the time left; None is one that knows nothing.
+    A folder that is removed on the way is made anew.
     Raises InterruptedRunError on Ctrl-C or SIGTERM, and what a step raises, FloatingPointError where the fit diverges;
     with a checkpoint and the volume of the last good step saved. Warns UnsavedWarning where the log or a checkpoint
     cannot be written.
@@ -77,11 +78,10 @@ def descend_recorded(
     steps, before = minimise(problem, step), 0.0 if step is None else step.seconds
     with (
         open_log(out / LOG, rows) as log,
-        Bar(forecast := Forecast(problem), problem.steps, len(rows)) as bar,
+        Bar(forecast or Forecast(problem), problem.steps, len(rows)) as bar,
         signals_kept() as check_signals,
     ):
         try:
-            tell_foreseen(problem, forecast, len(rows))
             for latest in steps:
                 good, step = step, latest
                 log.add(step.row)

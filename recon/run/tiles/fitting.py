@@ -12,9 +12,10 @@ from torch import Tensor
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference
+from recon.report.forecast import Forecast
 from recon.run.checkpoint import Checkpoint
 from recon.run.interruption import InterruptedRunError
-from recon.run.recorded import STOPPING, descend_recorded
+from recon.run.recorded import STOPPING, descend_recorded, tell_foreseen
 from recon.run.results import ResultsError, Tiled, leave_interrupted, model_images
 from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept
 from recon.tiling.blending import blended_images, blended_volume
@@ -57,14 +58,18 @@ class TiledFit:
         Raises as `descend_recorded` does, with the tile's checkpoint and the volume of the fitted tiles left in the
         folder, and ResultsError where a fitted tile can't be kept.
         """
-        for number, tile in enumerate(self.tiles, 1):
-            if self.kept(tile) is None:
-                print(f"tile {tile}, {number} of {len(self.tiles)}")
-                self.fit(tile)
+        forecast = Forecast(self.problem(self.tiles[0]))
+        for number, tile in enumerate(self.tiles):
+            if self.kept(tile) is not None:
+                continue
+            if forecast.untried:
+                tell_foreseen(self.problem(tile), forecast, tiles=len(self.tiles) - number)
+            print(f"tile {tile}, {number + 1} of {len(self.tiles)}")
+            self.fit(tile, forecast)
         return self.together()
 
-    def fit(self, tile: Tile) -> None:
-        """Fit one tile and keep it. Raises as `fitted` does."""
+    def fit(self, tile: Tile, forecast: Forecast) -> None:
+        """Fit one tile and keep it. forecast: of the time left. Raises as `fitted` does."""
         folder, identity, problem = folder_of(self.out, tile), self.identity_of(tile), self.problem(tile)
         folder.mkdir(parents=True, exist_ok=True)
         start = begun(folder, identity)
@@ -73,7 +78,7 @@ class TiledFit:
             return self.leave_so_far(tile, step)
 
         try:
-            ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave)
+            ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave, forecast)
         except InterruptedRunError as error:
             raise InterruptedRunError(f"tile {tile}: {error}") from None
         except STOPPING as error:
