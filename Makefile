@@ -56,6 +56,7 @@ bench: $(INSTALLED)
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/whole.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/transforms.py
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/planner.py
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/on_gpu.py
 	$(BIN)/python benchmarks/performance_figure.py

@@ -22,6 +22,7 @@ ROOMS = (
     "scalar",
     "grid",
     "memory",
+    "ranks",
     "plane_waves",
     "specimen",
     "fidelity",

@@ -12,6 +12,7 @@ the two beams. Intensity is relative to the empty bright field, so an empty DIC 
 
 from torchdic.errors import (
     ApertureWarning,
+    LostRankError,
     SamplingWarning,
     ShortageWarning,
     ShortOfMemoryError,
@@ -61,6 +62,7 @@ __all__ = [
     "Grid",
     "JonesPupil",
     "Layer",
+    "LostRankError",
     "Microscope",
     "Objective",
     "Plan",

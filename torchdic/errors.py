@@ -72,6 +72,10 @@ class ShortageWarning(UserWarning):
     """A GPU's memory ran out although there seemed to be room; the computation goes on in smaller batches."""
 
 
+class LostRankError(RuntimeError):
+    """Another of the processes that compute together has ended, without which they can't go on."""
+
+
 class ToleranceWarning(UserWarning):
     """No fidelity that was tried meets the tolerance. The message says by how much the best one misses it, and why."""
 

@@ -29,6 +29,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
+from torchdic.forward.own_part import own_part
 from torchdic.grid import Grid
 from torchdic.imaging.pupil import Pupil, Waves
 from torchdic.instrument.microscope import Acquisition, Microscope, in_medium
@@ -39,6 +40,7 @@ from torchdic.plane_waves import exp_i, to_field, to_spectrum
 from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
 from torchdic.propagation.split_step import LOWEST_PZ
+from torchdic.ranks.shared import shared
 from torchdic.scalar import number, scalar
 from torchdic.specimen.volume import Volume
 
@@ -116,7 +118,7 @@ def transfer_functions(
     The sources are summed once for all prisms.
     """
     n0, dtype, device = _medium(background, dtype, device)
-    M, _ = _kernel(grid, microscope, acquisition, n0, fidelity, dtype, device)
+    M, _ = _kernel(grid, microscope, acquisition, n0, fidelity)
     if absorption:
         M = 1j * M
     transfers = []
@@ -140,7 +142,7 @@ def linear_image(
     pad = fidelity.padding
     grid = volume.grid.widened(pad, pad)
     n0, dtype, device = volume.background, volume.delta.dtype, volume.delta.device
-    M, through = _kernel(grid, microscope, acquisition, n0, fidelity, dtype, device)
+    M, through = _kernel(grid, microscope, acquisition, n0.to(device, dtype), fidelity)
     scattered = to_spectrum(F.pad(volume.delta, (pad,) * 4))
     if volume.absorption is not None:
         scattered = scattered + 1j * to_spectrum(F.pad(volume.absorption, (pad,) * 4))
@@ -179,36 +181,52 @@ def _kernel(
     acquisition: Acquisition,
     background: Tensor,
     fidelity: Fidelity,
-    dtype: torch.dtype,
-    device: torch.device,
 ) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
     """M(f; z_f − z) of the module's docstring, (focus, z, y, x), and the share of the light that passes the pupil."""
-    microscope = in_medium(microscope, number(background), dtype)
+    microscope = in_medium(microscope, number(background), background.dtype)
     if microscope.lenses is not None:
         raise ValueError(
             "the linear transfer takes a prism's factor out of the sum over waves: it can't hold a polarisation pupil"
         )
-    colours = [
-        (share, *_kernel_of_colour(grid, part, acquisition, background, fidelity, dtype, device))
-        for part, share in microscope.colours()
+    colours = microscope.colours()
+    kernels = [
+        shared(_cross_terms, _part_of_cross_terms, grid, part, acquisition, background, fidelity) for part, _ in colours
     ]
+    through = [_passing(part, background, fidelity) for part, _ in colours]
     if microscope.spectrum is None:
-        _, M, through = colours[0]
-        return M, through
-    kernels, shares_through = zip(*((share * M, share * passed) for share, M, passed in colours), strict=True)
-    return torch.stack(kernels).sum(0), torch.stack(shares_through).sum()
+        return kernels[0], through[0]
+    shares = [share for _, share in colours]
+    M, passed = (
+        torch.stack([share * part for share, part in zip(shares, parts, strict=True)]).sum(0)
+        for parts in (kernels, through)
+    )
+    return M, passed
 
 
-def _kernel_of_colour(
-    grid: Grid,
-    microscope: Microscope,
-    acquisition: Acquisition,
-    background: Tensor,
-    fidelity: Fidelity,
-    dtype: torch.dtype,
-    device: torch.device,
-) -> tuple[Complex[Tensor, "focus z y x"], Float[Tensor, ""]]:
-    """`_kernel` in light of one wavelength."""
+def _passing(microscope: Microscope, background: Tensor, fidelity: Fidelity) -> Float[Tensor, ""]:
+    """The share of the light that passes the pupil."""
+    momentum, weights = microscope.sources(fidelity.sources, dtype=background.dtype, device=background.device)
+    if microscope.objective is None:
+        return weights.sum()
+    return (weights * microscope.objective.aperture(momentum[:, :, None, None])[:, 0, 0]).sum()
+
+
+def _part_of_cross_terms(
+    grid: Grid, microscope: Microscope, acquisition: Acquisition, background: Tensor, fidelity: Fidelity
+) -> Complex[Tensor, "focus z y x"]:
+    """A rank's part of `_cross_terms`."""
+
+    def terms(lit: Microscope, few: Acquisition, _: object) -> Tensor:
+        return _cross_terms(grid, lit, few, background, fidelity)
+
+    return own_part(terms, microscope, acquisition, fidelity, axis=0)
+
+
+def _cross_terms(
+    grid: Grid, microscope: Microscope, acquisition: Acquisition, background: Tensor, fidelity: Fidelity
+) -> Complex[Tensor, "focus z y x"]:
+    """M in light of one wavelength, by this process."""
+    dtype, device = background.dtype, background.device
     k0, frequencies = 2 * math.pi / microscope.wavelength, grid.frequencies(dtype=dtype, device=device)
     spreads, plane = propagation_of(fidelity).spreads, fidelity.reference_plane or 0.0
     depths, overlaps = _slabs(grid, fidelity.steps if spreads else None, dtype, device)
@@ -238,15 +256,11 @@ def _kernel_of_colour(
             at_slice = at_slice @ overlaps.to(at_slice.dtype)
         return (at_focus @ at_slice).permute(2, 3, 0, 1)
 
-    through = weights.sum()
-    if microscope.objective is not None:
-        through = (weights * microscope.objective.aperture(momentum[:, :, None, None])[:, 0, 0]).sum()
     planes = len(depths) + grid.shape[0] + len(foci)
     pixels = grid.shape[1] * grid.shape[2]
     # complex planes, and the phases from which they are made
     each = 4 * planes * pixels * momentum.element_size()
-    M = sum_over_sources(contribution, (momentum, weights), max(1, spared(fidelity.memory, device) // each))
-    return M, through
+    return sum_over_sources(contribution, (momentum, weights), max(1, spared(fidelity.memory, device) // each))
 
 
 def _slabs(

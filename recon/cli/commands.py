@@ -19,6 +19,7 @@ from typing import NoReturn
 
 from recon.cli import arguments
 from recon.cli.exit_codes import BAD_INPUT, INTERRUPTED
+from recon.cli.processes.torchrun import place, report
 from recon.report.terminal import write_plainly
 
 
@@ -154,9 +155,18 @@ def main(typed: Sequence[str] | None = None) -> int:
 
     typed: the words after `torchdic`; None takes them from the command line.
     Returns the exit code: 0, 1 for a fit that diverges or an installation that errs, 2 for bad input, 130 for an
-    interruption.
+    interruption. Of several processes that torchrun has started, the first one's counts.
     """
     write_plainly()
+    found = place()
+    if found is None:
+        return _run(typed)
+    with interrupted_at_once():
+        from recon.cli.processes.together import take_part
+    return take_part(found, partial(_run, typed))
+
+
+def _run(typed: Sequence[str] | None) -> int:
     words = list(sys.argv[1:] if typed is None else typed)
     name, chosen = next(
         ((name, row) for name, row in COMMANDS.items() if words and words[0] in (name, *row.aliases)), ("", None)
@@ -216,7 +226,9 @@ class _Parser(argparse.ArgumentParser):
     """A parser that reports an error in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f"{self.prog}: error: {message}\n")
+        line = f"{self.prog}: error: {message}"
+        report(line)
+        self.exit(BAD_INPUT, f"{line}\n")
 
 
 def _parser(chosen: Command | None) -> argparse.ArgumentParser:

@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 from recon.config.reading import load
 from recon.config.schema import AssumedWarning, ConfigError
 from recon.run.reconstruct import reconstruct
+from torchdic.ranks.shared import check_ranks
 
 
 def run(options: argparse.Namespace) -> None:
@@ -32,4 +33,5 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _interrupt(_number: int, _frame: object) -> NoReturn:
+    check_ranks()  # torchrun sends SIGTERM where one has ended
     raise KeyboardInterrupt

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from recon.cli.doctor.selftest import SelfTestError
 from recon.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
+from recon.cli.processes.torchrun import fail
 from recon.config.schema import AssumedWarning, ConfigError, UnlikelyWarning
 from recon.report.html.page import ForeignReportError, leave_report
 from recon.run.checkpoint import CheckpointError, UnsavedWarning
@@ -20,10 +21,11 @@ from recon.run.folder.record import Record
 from recon.run.folder.results import FinishedError
 from recon.run.interruption import InterruptedRunError
 from recon.run.results import ResultsError
-from torchdic import ApertureWarning, SamplingWarning, ToleranceWarning
+from torchdic import ApertureWarning, LostRankError, SamplingWarning, ToleranceWarning
 from torchdic.errors import BatchWarning, SidewaysError, StackError, TurnedRaysError, UnstableError
 from torchdic.files.whole import WriteError
 from torchdic.memory.shortage import as_shortage, is_shortage
+from torchdic.ranks.signals import ignore_signals
 
 # What the user can put right, in one line that says what.
 WRONG = (
@@ -62,6 +64,9 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
         return _fail(f"{_input(options)}{error}; the wave may cross it", BAD_INPUT)
     except (UnstableError, SidewaysError) as error:
         return _fail(f"{_input(options)}{error}", BAD_INPUT)
+    except LostRankError as error:
+        ignore_signals()  # torchrun's, which ends the others
+        return _fail(str(error), FAILED)
     except (FloatingPointError, SelfTestError) as error:
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
@@ -140,5 +145,5 @@ def _show_each_warning_once() -> None:
 
 
 def _fail(message: str, code: int) -> int:
-    print(f"torchdic: error: {message}", file=sys.stderr)
+    fail(message)
     return code

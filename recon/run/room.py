@@ -26,6 +26,7 @@ from torchdic.forward.foresee import AMPLE
 from torchdic.memory.free import check_room, check_volume, free_bytes
 from torchdic.memory.held import course_of, most
 from torchdic.memory.signature import stand_in
+from torchdic.ranks.group import alone
 
 # Pixels along a side of the sample that is measured, and steps of its descent by each method: the last of them hold
 # what all hold. Newton's hold the most once the careful ones have filled the memory of secants.
@@ -94,7 +95,8 @@ def check_room_for_direct(method: str, data: Tensor, setup: Setup, bounds: Bound
             else:
                 path_length(sample, few, None)
 
-    wanted = math.ceil(most(course_of(solve)) / share)
+    with alone():  # the bytes are counted in this process
+        wanted = math.ceil(most(course_of(solve)) / share)
     check_room(wanted, free, f"A volume of {_named(setup.volume.grid)} voxels by method '{method}'")
 
 
@@ -136,7 +138,8 @@ def held_beside_images(problem: Problem, misfit: Callable[[Tensor], Misfit], fid
         volume = Volume(few, learned, setup.volume.background)
         image(volume, microscope, setup.acquisition, ample).sum().backward()
 
-    beside = most(course_of(descend)) - most(course_of(compute_image))
+    with alone():  # the bytes are counted in this process
+        beside = most(course_of(descend)) - most(course_of(compute_image))
     return math.ceil(beside / share)
 
 

@@ -22,6 +22,7 @@ from torchdic.memory.free import check_room, free_bytes
 from torchdic.memory.signature import is_learned, signature
 from torchdic.propagation.base import propagation_of
 from torchdic.propagation.presets import STANDARD
+from torchdic.ranks.group import ranks_here
 from torchdic.scalar import number
 from torchdic.specimen.volume import Volume
 
@@ -131,7 +132,7 @@ class _Room:
 
     def check_fits(self, ample: int, what: str) -> None:
         """Raise ShortOfMemoryError where the scene needs more memory than is free; see `allot`."""
-        free = free_bytes(self.device)
+        free = self._free
         if free is None or ample <= free:
             return
         if self._peak(Batches(self.sources)) > free:
@@ -142,11 +143,17 @@ class _Room:
 
         ample: more bytes than the scene holds. what: the scene, for the message.
         """
-        budget = self._budget(memory, free_bytes(self.device))
+        budget = self._budget(memory, self._free)
         if ample <= budget:
             return Batches(self.sources)
         self.check_fits(ample, what)
         return self._fitted(budget)
+
+    @property
+    def _free(self) -> int | None:
+        """Bytes that are free for this process: the ranks on a machine share its memory."""
+        free = free_bytes(self.device)
+        return free // ranks_here() if free is not None and self.device.type == "cpu" else free
 
     def _budget(self, memory: int, free: int | None) -> int:
         """Bytes that an image may hold: what is allowed, what is free, and on the CPU without a gradient its caches."""

@@ -1,16 +1,21 @@
 """The whole microscope: from a specimen to the images of its prisms and focus planes."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchdic.fidelity import Fidelity
 from torchdic.forward.foresee import allot, allot_fields, check_fits
+from torchdic.forward.own_part import own_part
 from torchdic.forward.passage import FieldPassage, Passage
 from torchdic.grid import Grid
 from torchdic.instrument.microscope import Acquisition, Microscope, check_sampling, in_medium
 from torchdic.memory.shortage import halved_once
 from torchdic.propagation.presets import STANDARD
+from torchdic.ranks.shared import shared
 from torchdic.scalar import number, scalar
 from torchdic.specimen.volume import Volume
 
@@ -33,17 +38,7 @@ def image(
     n0 = number(volume.background)
     microscope = in_medium(microscope, n0, volume.delta.dtype)
     check_sampling(microscope, volume.grid, n0)
-    scene = volume, microscope, acquisition, fidelity
-
-    def images() -> Tensor:
-        if fidelity.object_aberration is None:
-            batches = allot(*scene)
-            return Passage.through(*scene).images(batches)
-        check_fits(*scene)
-        passage = Passage.through(*scene)
-        return passage.images(allot(*scene, passage.most_levels))
-
-    return halved_once(images, volume.delta.device)
+    return shared(_image, _part_of_image, volume, microscope, acquisition, fidelity)
 
 
 def image_field(
@@ -81,4 +76,39 @@ def image_field(
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
     n0 = scalar(background, real)
     passage = FieldPassage(transmission, grid, n0, microscope, acquisition, fidelity)
-    return halved_once(lambda: passage.images(allot_fields(passage)), real.device)
+    return shared(_image_of_field, _part_of_image_of_field, passage)
+
+
+def _image(volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity) -> Tensor:
+    """An image by this process."""
+    scene = volume, microscope, acquisition, fidelity
+
+    def images() -> Tensor:
+        if fidelity.object_aberration is None:
+            batches = allot(*scene)
+            return Passage.through(*scene).images(batches)
+        check_fits(*scene)
+        passage = Passage.through(*scene)
+        return passage.images(allot(*scene, passage.most_levels))
+
+    return halved_once(images, volume.delta.device)
+
+
+def _part_of_image(volume: Volume, microscope: Microscope, acquisition: Acquisition, fidelity: Fidelity) -> Tensor:
+    """A rank's part of an image."""
+    return own_part(lambda lit, few, _: _image(volume, lit, few, fidelity), microscope, acquisition, fidelity)
+
+
+def _image_of_field(passage: FieldPassage) -> Tensor:
+    return halved_once(lambda: passage.images(allot_fields(passage)), passage.transmission.device)
+
+
+def _part_of_image_of_field(passage: FieldPassage) -> Tensor:
+    """A rank's part of an image of a field."""
+    transmission = passage.transmission
+
+    def images(lit: Microscope, few: Acquisition, directions: Sequence[int]) -> Tensor:
+        own = transmission if transmission.ndim == 2 else transmission[list(directions)]
+        return _image_of_field(replace(passage, transmission=own, microscope=lit, acquisition=few))
+
+    return own_part(images, passage.microscope, passage.acquisition, passage.fidelity)

@@ -132,7 +132,7 @@ def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, 
     if size >= len(per_source[0]):
         return function(*per_source)
     batches = zip(*(t.split(size) for t in per_source), strict=True)
-    with _worst_of_each_kind():
+    with worst_of_each_kind():
         total = recompute(function, *next(batches), when=True)
         for batch in batches:
             total = total + recompute(function, *batch, when=True)
@@ -140,7 +140,7 @@ def sum_over_sources(function: Callable[..., Tensor], per_source: tuple[Tensor, 
 
 
 @contextmanager
-def _worst_of_each_kind() -> Iterator[None]:
+def worst_of_each_kind() -> Iterator[None]:
     """Of each kind of BatchWarning give only the worst, at the end. Other warnings pass through."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -1,0 +1,1 @@
+"""One command by several processes, as torchrun starts them."""
