@@ -17,6 +17,7 @@ from recon.fit.problem import Problem
 from torchdic import Acquisition, Fidelity, Microscope, Volume
 from torchdic.instrument.microscope import limited
 from torchdic.planning.cost import directions, timed, work
+from torchdic.ranks.group import rank
 from torchdic.scalar import number
 
 # What things cost, in images: an image with its gradient; of a Newton step, the model's minimum, in images of a single
@@ -154,13 +155,13 @@ def _cost(problem: Problem, number: int) -> float:
 
 
 class Bar(tqdm):
-    """A progress bar over a descent's steps, whose time left is the forecast's."""
+    """A progress bar over a descent's steps, whose time left is the forecast's; of several processes, the first's."""
 
     def __init__(self, forecast: Forecast, total: int, initial: int) -> None:
         self._forecast = forecast
         self._left: float | None = forecast.left(initial)
         form = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps [{elapsed}, {left}{postfix}]"
-        super().__init__(total=total, initial=initial, bar_format=form)
+        super().__init__(total=total, initial=initial, bar_format=form, disable=rank() > 0)
 
     def step(self, number: int, spent: float, misfit: float) -> None:
         """Show a step. number: counted from 1. spent: seconds that it took. misfit: before it."""

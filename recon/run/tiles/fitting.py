@@ -1,5 +1,6 @@
 """A field fitted tile by tile, and what its tiles say together."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +23,8 @@ from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
 from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first
 from torchdic.files.whole import WriteError
+from torchdic.ranks.group import rank, ranks
+from torchdic.ranks.shared import everywhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +61,28 @@ class TiledFit:
         Raises as `descend_recorded` does, with the tile's checkpoint and the volume of the fitted tiles left in the
         folder, and ResultsError where a fitted tile can't be kept.
         """
-        forecast = Forecast(self.problem(self.tiles[0]))
-        for number, tile in enumerate(self.tiles):
-            if self.kept(tile) is not None:
-                continue
+        first, *others = self.tiles
+        forecast = Forecast(self.problem(first))
+        if self.kept(first) is None:
+            tell_foreseen(self.problem(first), forecast, tiles=math.ceil(len(self.tiles) / ranks()))
+            self.fit(first, forecast)
+        missing = [tile for tile in others if self.kept(tile) is None]
+        if missing:
             if forecast.untried:
-                tell_foreseen(self.problem(tile), forecast, tiles=len(self.tiles) - number)
-            print(f"tile {tile}, {number + 1} of {len(self.tiles)}")
-            self.fit(tile, forecast)
+                tell_foreseen(self.problem(missing[0]), forecast, tiles=math.ceil(len(missing) / ranks()))
+            everywhere(_fit_share, self, missing, forecast)
         return self.together()
 
     def fit(self, tile: Tile, forecast: Forecast) -> None:
         """Fit one tile and keep it. forecast: of the time left. Raises as `fitted` does."""
+        print(f"tile {tile}, {self.tiles.index(tile) + 1} of {len(self.tiles)}")
         folder, identity, problem = folder_of(self.out, tile), self.identity_of(tile), self.problem(tile)
         folder.mkdir(parents=True, exist_ok=True)
         start = begun(folder, identity)
 
         def leave(step: Step) -> str:
-            return self.leave_so_far(tile, step)
+            # of several processes, the first leaves it for all
+            return self.leave_so_far(tile, step) if rank() == 0 else "its Δn so far is in the checkpoint"
 
         try:
             ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave, forecast)
@@ -162,3 +169,9 @@ class TiledFit:
         delta = self.volume([(tile, step.delta.detach().cpu())])
         path = leave_interrupted(self.out, delta, self.whole.setup.field, f"delta n, interrupted after {number}")
         return f"{path.name} holds Δn so far: {number}, and this one as it is"
+
+
+def _fit_share(fit: TiledFit, tiles: Sequence[Tile], forecast: Forecast) -> None:
+    """Fit a process' share of some tiles. forecast: of the time left of one."""
+    for tile in tiles[rank() :: ranks()]:
+        fit.fit(tile, forecast)
