@@ -32,7 +32,7 @@ from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.cut_field import margin_beyond
 from recon.report.metrics import volume_error
 from recon.run.reconstruct import RECOMMENDED
-from recon.run.room import bytes_of_descent
+from recon.run.room import bytes_held
 from recon.run.tiles.sizes import OVERLAP
 from recon.tiling.blending import blended_volume
 from recon.tiling.layout import Layout
@@ -104,7 +104,7 @@ def solved(problem: Problem) -> tuple[Step, float]:
 def fitted_whole(problem: Problem) -> Fit:
     """The field in one fit."""
     last, seconds = solved(problem)
-    return Fit(last.delta, seconds, bytes_of_descent(problem, GaussianMisfit))
+    return Fit(last.delta, seconds, bytes_held(problem, GaussianMisfit))
 
 
 def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...]) -> Fit:
@@ -114,7 +114,7 @@ def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...]) 
         part = problem_of_tile(problem, layout, tile, noise, shared)
         last, seconds = solved(part)
         if shared is None:
-            shared, largest = SharedByTiles.by(part, last), bytes_of_descent(part, GaussianMisfit)
+            shared, largest = SharedByTiles.by(part, last), bytes_held(part, GaussianMisfit)
         found.append((tile, last.delta))
         total += seconds
     return Fit(blended_volume(layout, FIELD.shape[0], found), total, largest)

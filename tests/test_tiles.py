@@ -3,6 +3,7 @@
 import json
 import math
 from collections import deque
+from dataclasses import replace
 
 import pytest
 import torch
@@ -24,7 +25,18 @@ from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
 from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first, without_margin
-from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, ShortOfMemoryError, Volume
+from torchdic import (
+    Acquisition,
+    Camera,
+    Condenser,
+    Fidelity,
+    Grid,
+    Microscope,
+    Objective,
+    Prism,
+    ShortOfMemoryError,
+    Volume,
+)
 
 NOISE = 0.004
 
@@ -245,6 +257,33 @@ def test_given_weights_mean_in_a_tile_what_they_mean_in_the_whole(field):
     here, there = (slice(None), slice(9, 15), slice(6, 14)), (slice(None), slice(14, 20), slice(11, 19))
     ratio = float(own_priors[there].norm() / priors[here].norm())
     assert float(own_misfit[there].norm() / misfit[here].norm()) == pytest.approx(ratio, rel=0.05)
+
+
+@pytest.mark.parametrize("voxels_per_pixel", [1.0, 1.5, 2.0])
+def test_a_tile_of_the_true_volume_has_the_images_of_the_field(voxels_per_pixel):
+    """Away from the tile's border, where light comes from beside it; a camera's pixels lie where the field's do."""
+    side = 0.17 * voxels_per_pixel
+    microscope = replace(MICROSCOPE, camera=None if voxels_per_pixel == 1 else Camera(pixel_size=side))
+    grid = replace(FIELD, shape=(5, 36, 90))
+    truth = torch.nn.functional.pad(scene(), (13, 13, 6, 6))
+    with torch.no_grad():
+        whole_setup = Setup(Volume(grid, truth, 1.33), microscope, ACQUISITION)
+        images = whole_setup.images(FIDELITY)
+        setup = Setup(empty_medium(grid, 1.33, images), microscope, ACQUISITION)
+        whole = Problem.from_recipe(images, setup, FIDELITY, Recipe(), GaussianMisfit, [NOISE] * 2)
+        margin = 12
+        layout = Layout.of(grid, setup.pixels, 60, margin, 12)
+        assert len(layout) == 2
+        wide = torch.nn.functional.pad(truth, (margin,) * 4)
+        for tile in layout:
+            rows, columns = tile.rows.voxels, tile.columns.voxels
+            delta = wide[:, rows.start : rows.stop + 2 * margin, columns.start : columns.stop + 2 * margin]
+            part = problem_of_tile(whole, layout, tile, [NOISE] * 2)
+            found = part.unknowns[0].put(delta, part.setup).images(FIDELITY)
+            off = found - part.misfit.data
+            border = round(4 / voxels_per_pixel)
+            inner = off[..., border:-border, border:-border]
+            assert float(inner.abs().max()) < 0.02 * float((images - images.mean((2, 3), keepdim=True)).abs().max())
 
 
 def test_a_support_is_cut_with_its_tile(field):

@@ -17,7 +17,7 @@ from recon.run.folder.prepared import keep_folder
 from recon.run.interruption import InterruptedRunError, signals_kept
 from recon.run.log import open_log
 from recon.run.results import VOLUME, leave_interrupted
-from recon.run.room import bytes_of_descent
+from recon.run.room import bytes_held
 from torchdic.errors import StackError
 from torchdic.files.whole import WriteError
 from torchdic.memory.free import GIB
@@ -42,7 +42,7 @@ def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, tiles: 
         return
     words = f"foreseen: {spoken(tiles * seconds)}{f' for {tiles} tiles' if tiles > 1 else ''}"
     if tiles * seconds > LONG:
-        words += f" and {bytes_of_descent(problem, GaussianMisfit) / GIB:.2g} GiB"
+        words += f" and {bytes_held(problem, GaussianMisfit) / GIB:.2g} GiB"
     if problem.method == "newton" and problem.steps > USUAL_STEPS:
         words += f", if descents end after {USUAL_STEPS} of {problem.steps} steps, as is usual"
     print(words)

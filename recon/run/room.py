@@ -13,6 +13,7 @@ from recon.earlier.tikhonov import MEMORY as MEMORY_OF_LINEAR
 from recon.earlier.tikhonov import tikhonov
 from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.descent import minimise
+from recon.fit.newton.correction import drafts
 from recon.fit.newton.descent import COARSE_STEPS
 from recon.fit.newton.secants import MEMORY
 from recon.fit.planned import GivenFidelity
@@ -57,11 +58,27 @@ def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit])
     free = free_bytes(problem.misfit.data.device)
     if free is None or _ample(problem.setup) <= free:
         return
-    wanted = bytes_of_descent(problem, misfit)
+    wanted = bytes_at_least(problem, misfit)
     check_room(wanted, free, f"Steps of a reconstruction of {_named(problem.setup.volume.grid)} voxels")
 
 
-def bytes_of_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
+def bytes_held(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
+    """The bytes that a descent will hold, beside its data, with its images in batches as large as their budget allows.
+
+    misfit: makes the problem's misfit from data. Where no fidelity is planned yet, they are those of its first steps.
+    """
+    setup, careful = problem.setup, problem.fidelity.coarse
+    scene = setup.volume, setup.microscope, setup.acquisition
+    peaks = []
+    learned = careful
+    if problem.method == "newton":  # gradients are those of drafts, and careful images have none
+        _, learned = drafts(careful, problem.fidelity.draft_sources)
+        peaks.append(foreseen(*scene, careful, gradient=False).peak)
+    peaks.append(foreseen(*scene, learned, gradient=True).peak)
+    return max(peaks) + held_beside_images(problem, misfit, careful)
+
+
+def bytes_at_least(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
     """The bytes that a descent needs at least, beside its data; without its images' where no fidelity is planned yet.
 
     misfit: makes the problem's misfit from data.

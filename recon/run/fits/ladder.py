@@ -64,7 +64,7 @@ def configured(config: Config, candidate: FitCandidate) -> Config:
     steps = section.steps if candidate.method == section.method else None
     if steps is None and candidate.method == "adam":
         steps = FEW_STEPS.get(propagation or "")
-    recipe = replace(section, method=candidate.method, steps=steps)
+    recipe = replace(section, method=candidate.method, steps=steps, tiles=None)
     fidelity = RECOMMENDED
     if propagation is not None:
         fidelity = _usual(config, candidate.method, propagation)
