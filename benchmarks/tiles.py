@@ -40,15 +40,25 @@ from recon.tiling.part import SharedByTiles, problem_of_tile, strongest_first
 from specimens import GradedEllipsoid, Together
 from torchdic import Grid
 
-FIELD = Grid((12, 112, 112), (0.4, 0.17, 0.17))
-FOCUS = tuple(0.8 * (i - 2.5) for i in range(6))
-SIDE = 70
+FIELD = Grid((12, 144, 144), (0.4, 0.17, 0.17))
+FOCUS = tuple(0.6 * (i - 3.5) for i in range(8))
+SIDE = 92
 
 
 def beads() -> Together:
     """Beads of several sizes and contrasts, two of them on the seams."""
     generator = torch.Generator().manual_seed(8)
-    places = [(-6.0, -6.2), (-6.5, 0.2), (-5.8, 6.1), (0.1, -5.9), (0.3, 0.4), (-0.6, 6.4), (6.2, -6.0), (6.4, 0.7)]
+    places = [
+        (-8.5, -8.7),
+        (-9.0, 0.2),
+        (-8.3, 8.6),
+        (0.1, -8.4),
+        (0.3, 0.4),
+        (-0.6, 8.9),
+        (8.7, -8.5),
+        (8.9, 0.7),
+        (8.2, 9.0),
+    ]
     found = []
     for y, x in places:
         z, radius, contrast = torch.rand(3, generator=generator).tolist()

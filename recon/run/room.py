@@ -15,7 +15,9 @@ from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.descent import minimise
 from recon.fit.newton.correction import drafts
 from recon.fit.newton.descent import COARSE_STEPS
+from recon.fit.newton.missed import MissedResponse
 from recon.fit.newton.secants import MEMORY
+from recon.fit.newton.weak_hessian import weak_responses
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
@@ -68,14 +70,28 @@ def bytes_held(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
     misfit: makes the problem's misfit from data. Where no fidelity is planned yet, they are those of its first steps.
     """
     setup, careful = problem.setup, problem.fidelity.coarse
-    scene = setup.volume, setup.microscope, setup.acquisition
-    peaks = []
-    learned = careful
+    scene, learned, others = (setup.volume, setup.microscope, setup.acquisition), careful, [0]
+    responses = 0
     if problem.method == "newton":  # gradients are those of drafts, and careful images have none
         _, learned = drafts(careful, problem.fidelity.draft_sources)
-        peaks.append(foreseen(*scene, careful, gradient=False).peak)
-    peaks.append(foreseen(*scene, learned, gradient=True).peak)
-    return max(peaks) + held_beside_images(problem, misfit, careful)
+        others.append(foreseen(*scene, careful, gradient=False).peak)
+        responses = _bytes_of_responses(problem, learned, careful)
+    images = max(foreseen(*scene, learned, gradient=True).peak, *others)
+    return max(images + held_beside_images(problem, misfit, careful), responses)
+
+
+def _bytes_of_responses(problem: Problem, draft: Fidelity, careful: Fidelity) -> int:
+    """The most bytes that are held while transfer functions are made: measured on few pixels, scaled to the problem's.
+
+    draft, careful: of the later steps, see `recon.fit.newton.correction.drafts`.
+    """
+    setup, dtype = problem.setup, problem.misfit.data.dtype
+    few, data, share = _sample(setup, stand_in(setup.microscope), dtype)
+    missed = draft.sources < careful.sources and MissedResponse.bytes_for(setup, dtype.itemsize) <= careful.memory // 2
+    sources = careful.sources if missed else draft.sources
+    fidelity = replace(draft, sources=sources, memory=math.ceil(share * careful.memory))
+    with alone():  # the bytes are counted in this process
+        return math.ceil(most(course_of(lambda: weak_responses(few, fidelity, data))) / share)
 
 
 def bytes_at_least(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
