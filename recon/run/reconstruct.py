@@ -25,6 +25,7 @@ from recon.report.forecast import Forecast
 from recon.run import checkpoint
 from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data, load_support, looks, warn_of_changes
+from recon.run.folder.lock import when_done
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
@@ -37,7 +38,7 @@ from recon.run.room import (
     check_room_for_volume,
 )
 from recon.run.tiles.fitting import TiledFit
-from recon.run.tiles.kept import TILES, forget, remember_side
+from recon.run.tiles.kept import TILES, forget
 from recon.run.tiles.sizes import Cut, cut_of
 from torchdic import Fidelity
 from torchdic.memory.shortage import as_shortage
@@ -125,9 +126,8 @@ def _solved(config: Config, measured: Measured, problem: Problem, out: Path, ide
 
 
 def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out: Path, identity: str) -> Result:
-    """The results of a fit by tiles, which are removed once those are written."""
+    """The results of a fit by tiles, which are removed once the command has left all that it leaves."""
     problem, layout = cut.problem(whole), cut.layout
-    remember_side(out, layout.side, cut.memory)
     sides = f"{layout.along_y.count} × {layout.along_x.count} voxels"
     print(f"{len(layout)} tiles of {sides} and {layout.margin} more on each side (tiles = {layout.side})")
     tiled = TiledFit(problem, layout, measured.noise, out, identity, config.reconstruction.checkpoint_every).fitted()
@@ -136,7 +136,7 @@ def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out:
         result = write_results(out, config, measured, problem, tiled.ended, tiled=tiled)
     except ResultsError as error:
         raise ResultsError(f"{error}{GO_ON}") from error
-    forget(out)
+    when_done(lambda: forget(out))
     return result
 
 

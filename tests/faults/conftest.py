@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from functools import cache
 
 import pytest
 from runs import LAUNCHES, Scene
@@ -9,15 +10,28 @@ from runs import LAUNCHES, Scene
 TITLES = ("case", "what is lost until --resume", "what is said", "exit code")
 
 
-@pytest.fixture(scope="session", params=LAUNCHES.values(), ids=LAUNCHES)
-def scene(request, tmp_path_factory):
-    return Scene.made(tmp_path_factory.mktemp("scene"), request.param)
+@pytest.fixture(scope="session")
+def scenes(tmp_path_factory):
+    """A function that makes the scene of a launch, once."""
+    return cache(lambda name: Scene.made(tmp_path_factory.mktemp("scene"), LAUNCHES[name]))
 
 
 @pytest.fixture
-def tell(record_property):
+def launch(request):
+    """The name of the launch that a test is of; one process, where its parameters don't say."""
+    return getattr(request, "param", "one process")
+
+
+@pytest.fixture
+def scene(scenes, launch):
+    return scenes(launch)
+
+
+@pytest.fixture
+def tell(record_property, launch):
     """A function that adds a row to the table of faults."""
-    return lambda case, lost, said, code: record_property("fault", (case, lost, said, str(code)))
+    prefix = "" if launch == "one process" else f"{launch}: "
+    return lambda case, lost, said, code: record_property("fault", (prefix + case, lost, said, str(code)))
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
     python on_full_disk.py NAME N WORDS…
 
-The disk is that of the file's folder, and really is full: what a process writes to it fails in the system. It is filled
-by a file beside the folder.
+The disk is the one that the file's folder is on, and really is full: what a process writes to it fails in the system.
+It is filled by a file at its root.
 """
 
 import itertools
@@ -19,7 +19,8 @@ BALLAST = "ballast"
 
 def fill(folder: Path) -> None:
     """Leave no byte on a folder's disk."""
-    with suppress(OSError), (folder / BALLAST).open("wb", buffering=0) as file:
+    root = next(above for above in (folder, *folder.parents) if above.is_mount())
+    with suppress(OSError), (root / BALLAST).open("wb", buffering=0) as file:
         while True:
             file.write(bytes(1 << 16))
 
@@ -31,7 +32,7 @@ def fill_before(name: str, time: int) -> None:
     @contextmanager
     def filling(path: Path):
         if path.name == name and next(times) == time:
-            fill(path.parent.parent)
+            fill(path.absolute().parent)
         with moved_there(path) as partial:
             yield partial
 
@@ -39,7 +40,7 @@ def fill_before(name: str, time: int) -> None:
 
     def opened(event: str, arguments: tuple) -> None:
         if event == "open" and isinstance(arguments[0], str) and arguments[0].endswith(f"/{name}"):
-            fill(Path(arguments[0]).parent.parent)
+            fill(Path(arguments[0]).absolute().parent)
 
     if name == "log.csv":  # it isn't written whole, but as the steps are taken
         sys.addaudithook(opened)

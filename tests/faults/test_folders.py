@@ -1,11 +1,12 @@
 """What befalls the folder of a run, its stack and its clock."""
 
+import json
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
-from runs import HERE, told
+from runs import HERE, log, told
 
 from torchdic.files.stack import read_stack, write_stack
 
@@ -22,6 +23,25 @@ def test_a_folder_that_vanishes_is_made_anew(scene, tmp_path, tell):
     assert ended.code == 0
     scene.check_as_whole(out)
     tell("the folder vanishes during the run", "nothing", told(ended.said), ended.code)
+
+
+@pytest.mark.parametrize("launch", ["tiles"], indirect=True)
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_folder_that_vanishes_loses_the_tiles_that_were_fitted(scene, tmp_path, number, tell):
+    out, tiles = tmp_path / "out", list(json.loads((scene.whole / "metrics.json").read_text())["tiles"]["steps"])
+    with scene.started(out) as running:
+        running.wait_for(lambda: len(log(out / "tiles" / tiles[number])) >= 4)
+        shutil.rmtree(out)
+        ended = running.ended()
+    print(ended.output)
+    assert ended.code == (2 if number else 0)
+    assert "Traceback" not in ended.output
+    if number:
+        scene.check_resumed(out)
+    else:
+        scene.check_as_whole(out)
+    lost = f"{number} of {len(tiles)} tiles"
+    tell(f"the folder vanishes during tile {number + 1}", lost, told(ended.said), ended.code)
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused(scene, disk, tell):

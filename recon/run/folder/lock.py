@@ -3,7 +3,7 @@
 The system's lock on a file in the folder ends with the process that holds it, however that ends.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -78,6 +78,27 @@ def is_lost(folder: Path) -> bool:
         return (folder / LOCK).stat().st_ino != command.held[folder]  # the lock's inode is taken while it is held
     except OSError:
         return True
+
+
+def held_folder(folder: Path) -> Path:
+    """The folder that the command holds and in which a folder is; itself where there is none."""
+    command = _command.get()
+    held = {} if command is None else command.held
+    return next((above for above in (folder, *folder.parents) if above in held), folder)
+
+
+def when_done(last: Callable[[], None]) -> None:
+    """Do something when the command ends without an error, with its folders still held; outside a command at once."""
+    command = _command.get()
+    if command is None:
+        last()
+        return
+
+    def leave(kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            last()
+
+    command.ending.push(leave)
 
 
 def _release(lock: BaseFileLock) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from recon.config.schema import ConfigError
 from recon.run.checkpoint import UnsavedWarning
-from recon.run.folder.lock import hold, is_lost
+from recon.run.folder.lock import held_folder, hold, is_lost
 from torchdic.files.whole import written_whole
 
 
@@ -35,15 +35,21 @@ def prepare_folder(out: Path) -> None:
 
 
 def keep_folder(out: Path) -> None:
-    """Make the folder of a run anew where it was removed during the run, and warn UnsavedWarning of it.
+    """Make the folder of a run, or one in it, anew where it was removed during the run, and warn UnsavedWarning of it.
 
     Where it can't be made, nothing is said: what is written next will say so. Raises FolderInUseError where another run
     has made it.
     """
-    if out.is_dir() and not is_lost(out):
+    run = held_folder(out)
+    lost = is_lost(run)
+    if out.is_dir() and not lost:
         return
     try:
-        prepare_folder(out)
-    except ConfigError:
+        if lost or run == out:
+            prepare_folder(run)
+        out.mkdir(parents=True, exist_ok=True)
+    except (ConfigError, OSError):
         return
-    warnings.warn(f"{out}: the folder was removed during the run; it is made anew", UnsavedWarning, stacklevel=2)
+    warnings.warn(
+        f"{run if lost else out}: the folder was removed during the run; it is made anew", UnsavedWarning, stacklevel=2
+    )

@@ -1,7 +1,8 @@
 """A field fitted tile by tile, and what its tiles say together."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -15,10 +16,11 @@ from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference
 from recon.report.forecast import Forecast
 from recon.run.checkpoint import Checkpoint
+from recon.run.folder.prepared import keep_folder
 from recon.run.interruption import InterruptedRunError
 from recon.run.recorded import STOPPING, descend_recorded, tell_foreseen
 from recon.run.results import ResultsError, Tiled, leave_interrupted, model_images
-from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept
+from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept, prepared, remember_side
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
 from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first
@@ -77,7 +79,8 @@ class TiledFit:
         """Fit one tile and keep it. forecast: of the time left. Raises as `fitted` does."""
         print(f"tile {tile}, {self.tiles.index(tile) + 1} of {len(self.tiles)}")
         folder, identity, problem = folder_of(self.out, tile), self.identity_of(tile), self.problem(tile)
-        folder.mkdir(parents=True, exist_ok=True)
+        with _told():
+            self._prepare(folder)
         start = begun(folder, identity)
 
         def leave(step: Step) -> str:
@@ -91,10 +94,15 @@ class TiledFit:
         except STOPPING as error:
             error.args = (f"tile {tile}: {error}",)
             raise
-        try:
+        with _told():
+            self._prepare(folder)  # it may have been removed, with what it was in
             keep(folder, ended)
-        except WriteError as error:
-            raise ResultsError(f"{error}; make room and go on with --resume") from error
+
+    def _prepare(self, folder: Path) -> None:
+        """Make a tile's folder, and leave beside it what the tiles are. Raises WriteError and FolderInUseError."""
+        keep_folder(self.out)
+        prepared(folder)
+        remember_side(self.out, self.layout.side, self.whole.fidelity.coarse.memory)
 
     def kept(self, tile: Tile) -> Checkpoint | None:
         """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
@@ -124,15 +132,23 @@ class TiledFit:
         shared = None if tile == self.tiles[0] else self.shared
         return problem_of_tile(self.whole, self.layout, tile, self.noise, shared)
 
-    def volume(self, stopped: Sequence[tuple[Tile, Float[Tensor, "z row column"]]] = ()) -> Float[Tensor, "z y x"]:
-        """Δn of the field, of those tiles that are fitted, and of those that were stopped."""
-        fitted = ((tile, ended.step.delta) for tile, ended in self.ended())
+    def volume(
+        self,
+        ended: Iterable[tuple[Tile, Checkpoint]],
+        stopped: Sequence[tuple[Tile, Float[Tensor, "z row column"]]] = (),
+    ) -> Float[Tensor, "z y x"]:
+        """Δn of the field, of tiles that are fitted, and of those that were stopped."""
+        fitted = ((tile, found.step.delta) for tile, found in ended)
         return blended_volume(self.layout, self.whole.setup.field.shape[0], chain(fitted, stopped))
 
     def images(self) -> Float[Tensor, "prism focus y x"]:
         """The model's images of the field."""
-        found = ((tile, model_images(self.problem(tile), ended.step)) for tile, ended in self.ended())
+        found = ((tile, model_images(self.problem(tile), ended.step)) for tile, ended in self.all_found())
         return blended_images(self.layout, self.whole.setup.shape[:2], found)
+
+    def all_found(self) -> Iterator[tuple[Tile, Checkpoint]]:
+        """All tiles, one at a time. Raises as `found` does."""
+        return ((tile, self.found(tile)) for tile in self.tiles)
 
     def ended(self) -> Iterator[tuple[Tile, Checkpoint]]:
         """The fitted tiles, one at a time."""
@@ -146,10 +162,9 @@ class TiledFit:
     def together(self) -> Tiled:
         """What the fitted tiles say together."""
         steps, seconds = {}, {}
-        for tile in self.tiles:
-            last = self.found(tile).step
-            steps[str(tile)], seconds[str(tile)] = last.number, last.seconds
-        first, delta = self.found(self.tiles[0]), self.volume()
+        for tile, ended in self.all_found():
+            steps[str(tile)], seconds[str(tile)] = ended.step.number, ended.step.seconds
+        first, delta = self.found(self.tiles[0]), self.volume(self.all_found())
         values = {**self.shared.values, IndexDifference.name: delta}
         whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()))
         ended = replace(first, step=whole)
@@ -166,9 +181,18 @@ class TiledFit:
     def leave_so_far(self, tile: Tile, step: Step) -> str:
         """Leave the volume of the fitted tiles and of one that is stopped at a step; returns words about it."""
         number = f"{sum(1 for _ in self.ended())} of {len(self.tiles)} tiles"
-        delta = self.volume([(tile, step.delta.detach().cpu())])
+        delta = self.volume(self.ended(), [(tile, step.delta.detach().cpu())])
         path = leave_interrupted(self.out, delta, self.whole.setup.field, f"delta n, interrupted after {number}")
         return f"{path.name} holds Δn so far: {number}, and this one as it is"
+
+
+@contextmanager
+def _told() -> Iterator[None]:
+    """Within this block a tile's file that can't be written raises ResultsError, which says how to go on."""
+    try:
+        yield
+    except WriteError as error:
+        raise ResultsError(f"{error}; make room and go on with --resume") from error
 
 
 def _fit_share(fit: TiledFit, tiles: Sequence[Tile], forecast: Forecast) -> None:

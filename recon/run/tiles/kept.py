@@ -2,13 +2,14 @@
 
 import json
 import shutil
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from recon.run.checkpoint import Checkpoint, CheckpointError, load, save
 from recon.run.recorded import CHECKPOINT
 from recon.tiling.layout import Layout, Tile
-from torchdic.files.whole import write_json
+from torchdic.files.whole import PARTIAL, WriteError, remove_partial, write_json
 
 TILES = "tiles"
 
@@ -22,6 +23,15 @@ LAYOUT = "layout.json"
 def folder_of(out: Path, tile: Tile) -> Path:
     """The folder of a tile's log and checkpoint."""
     return out / TILES / str(tile)
+
+
+def prepared(folder: Path) -> None:
+    """Make a tile's folder, without what a process that was killed left half written in it. Raises WriteError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        remove_partial(folder)
+    except OSError as error:
+        raise WriteError.of(folder, error) from error
 
 
 def identity_of(whole: str, layout: Layout, tile: Tile, steps: int, shared: str = "") -> str:
@@ -52,8 +62,10 @@ def begun(folder: Path, identity: str) -> Checkpoint | None:
 
 
 def remember_side(out: Path, side: int, memory: int) -> None:
-    """Leave what the tiles of a run are, for another one to go on. side: as given. memory: of a tile's images."""
-    (out / TILES).mkdir(exist_ok=True)
+    """Leave what the tiles of a run are, for another one to go on, in the folder of its tiles, which exists.
+
+    side: as given. memory: of a tile's images. Raises WriteError.
+    """
     write_json(out / TILES / LAYOUT, {"side": side, "memory": memory})
 
 
@@ -70,5 +82,8 @@ def remembered_side(out: Path) -> tuple[int, int] | None:
 
 
 def forget(out: Path) -> None:
-    """Remove all tiles of a folder of results."""
-    shutil.rmtree(out / TILES, ignore_errors=True)
+    """Remove all tiles of a folder of results at once: a run that is killed meanwhile has all or none of them."""
+    leaving = out / f"{PARTIAL}{TILES}"
+    with suppress(OSError):
+        (out / TILES).rename(leaving)
+    shutil.rmtree(leaving, ignore_errors=True)
