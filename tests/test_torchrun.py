@@ -9,6 +9,7 @@ import time
 import pytest
 import tifffile
 from small_bead import CONFIG
+from test_tiles import CONFIG as TILES
 
 from recon.cli import main
 
@@ -22,6 +23,8 @@ LONG = (
     .replace("sources = 8", "sources = 24")
     .replace("shape = [6, 26, 24]", "shape = [12, 64, 60]")
 )
+
+IN_TILES = TILES.replace("shape = [3, 22, 40]", "shape = [3, 40, 40]")
 
 
 @pytest.fixture
@@ -75,6 +78,20 @@ def test_processes_find_the_volume_of_one(number, bead):
     assert run.returncode == 0, printed
     assert printed.count("several/volume.ome.tif: ") == 1
     assert as_by_one(bead) < 1e-4
+
+
+def test_tiles_that_processes_share_out_make_the_volume_of_one(tmp_path, monkeypatch, no_pictures):
+    """Four tiles: the first is fitted by both processes together, and of the others each fits its own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.toml").write_text(IN_TILES)
+    assert main(["simulate", "run.toml", "--out", "made"]) == 0
+    assert main(["reconstruct", "run.toml", "--out", "one"]) == 0
+    run = started(number=2)
+    printed = run.communicate()[0]
+    assert run.returncode == 0, printed
+    assert printed.count("4 tiles of ") == 1
+    assert not (tmp_path / "several" / "tiles").exists()
+    assert as_by_one(tmp_path) < 1e-4
 
 
 @LINUX
