@@ -84,6 +84,7 @@ def remembered_side(out: Path) -> tuple[int, int] | None:
 def forget(out: Path) -> None:
     """Remove all tiles of a folder of results at once: a run that is killed meanwhile has all or none of them."""
     leaving = out / f"{PARTIAL}{TILES}"
+    shutil.rmtree(leaving, ignore_errors=True)  # of a run that was killed
     with suppress(OSError):
         (out / TILES).rename(leaving)
     shutil.rmtree(leaving, ignore_errors=True)
