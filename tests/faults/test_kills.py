@@ -47,11 +47,12 @@ def test_a_run_whose_ranks_are_killed_goes_on_to_the_same_end(scene, tmp_path, l
             said, code = ended.said, ended.code
             assert OURS.search(ended.output) is None, ended.output
     steps = check_goes_on(scene, out)
-    tell(f"kill −9 of {which} at {KILLS[launch]} random steps", f"{steps} steps", told(said[:1]), code)
+    words = re.sub(r"after step \d+", "after step …", told(said[:1]))
+    tell(f"kill −9 of {which} at {KILLS[launch]} random steps", f"{steps} steps", words, code)
 
 
 def check_goes_on(scene, out):
-    """The steps that a killed run has lost; checks that it goes on to the same end."""
+    """Check that a killed run goes on to the same end, or was at it; returns the steps that it lost."""
     steps = scene.taken(out) - scene.saved(out)
     assert 0 <= steps <= EVERY
     if scene.is_finished(out):
