@@ -1,7 +1,7 @@
 """The site: `make docs`. The reference is made first, from the code; the blocks of all pages are checked.
 
-Sphinx, because its autodoc reads our docstrings, MyST the pages that are read on a code host too, and sphinx-gallery runs
-the examples; pydata's theme, because it is that of NumPy, SciPy and scikit-image, and needs no network.
+Sphinx, because its autodoc reads our docstrings, MyST the pages that are read on a code host too, and sphinx-gallery
+runs the examples; pydata's theme, because it is that of NumPy, SciPy and scikit-image, and needs no network.
 """
 
 import os
@@ -23,6 +23,7 @@ project_copyright = f"{author}, BSD-3-Clause"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
 exclude_patterns = ["_build", "generator", "gallery/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
 myst_heading_anchors = 4
+smartquotes = False  # they make a dash of an option's two hyphens
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 python_maximum_signature_line_length = 88

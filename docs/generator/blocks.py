@@ -1,8 +1,8 @@
 """The blocks of code on the pages are checked: what can be run in seconds is run, the rest is read.
 
-Python runs, all blocks of a page in one namespace. TOML is parsed. Of a shell's lines `torchdic …` is read by the command's
-parser, `make …` must be a target, `python …` a file, and `torchdic[…]` an extra. A block in which "…" stands for something
-that is left out is no code.
+Python runs, all blocks of a page in one namespace. TOML is parsed. Of a shell's lines `torchdic …` is read by the
+command's parser, `make …` must be a target, `python …` a file, and `torchdic[…]` an extra. A block in which "…" stands
+for something that is left out is no code.
 """
 
 import contextlib
@@ -40,11 +40,9 @@ def check(page: Path) -> None:
         if "…" in block and language != "sh":
             continue
         try:
-            {"sh": _shell, "toml": tomllib.loads, "python": lambda text: compile(text, page.name, "exec")}.get(
-                language, len
-            )(block)
+            READERS.get(language, len)(block)
         except (ValueError, SyntaxError) as error:
-            raise BlockError(f"{page.relative_to(ROOT)}: a block of {language}: {error}") from error
+            raise BlockError(f"{page.name}: a block of {language}: {error}") from error
 
 
 def run_python(page: Path) -> None:
@@ -79,8 +77,8 @@ def _shell(block: str) -> None:
             raise ValueError(f"{line}: the Makefile has no such target")
         if words[:1] == ["python"] and words[1].endswith(".py") and not (ROOT / words[1]).exists():
             raise ValueError(f"{line}: there is no such file")
-        for extra in re.findall(r"torchdic\[(\w+)\]", line):
-            if extra not in tomllib.loads(_text("pyproject.toml"))["project"]["optional-dependencies"]:
+        for extra in re.findall(r"(?:torchdic|\.)\[([\w,]+)\]", line):
+            if not {*extra.split(",")} <= {*tomllib.loads(_text("pyproject.toml"))["project"]["optional-dependencies"]}:
                 raise ValueError(f"{line}: there is no extra {extra}")
 
 
@@ -97,3 +95,6 @@ def _command(name: str, words: list[str]) -> None:
     parser.parse_args(arguments.repeated(words, COMMANDS[name].several))
     if said:
         raise ValueError(f"torchdic {shlex.join([name, *words])}: {said[0]}")
+
+
+READERS = {"sh": _shell, "toml": tomllib.loads, "python": lambda block: compile(block, "page", "exec")}

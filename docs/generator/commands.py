@@ -6,8 +6,8 @@ from recon.cli.commands import COMMANDS, Command
 
 HEAD = """# Every command
 
-Made from the parsers of the commands: it is what `torchdic COMMAND --help` says. Exit codes: 0 done, 1 a fit that diverges or
-an installation that errs, 2 what the user can put right, 130 interrupted.
+Made from the parsers of the commands: it is what `torchdic COMMAND --help` says. Exit codes: 0 done, 1 a fit that
+diverges or an installation that errs, 2 what the user can put right, 130 interrupted.
 
 """
 

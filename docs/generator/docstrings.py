@@ -9,6 +9,7 @@ import inspect
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 # What docutils would take for markup.
 _MARKUP = re.compile(r"([\\*|_])")
@@ -31,7 +32,8 @@ def read(docstring: str | None, names: Collection[str]) -> Read:
     docstring: as Python holds it, or None. names: what it may explain; another word before a colon is text.
     """
     found = Read()
-    for chunk, indented in _chunks(inspect.cleandoc(docstring or ""), names):
+    without_headings = re.sub(r"^[A-Z]\w+\n-+\n", "", inspect.cleandoc(docstring or ""), flags=re.MULTILINE)
+    for chunk, indented in _chunks(without_headings, names):
         named = _beginning(names).match(chunk)
         if indented or not named:
             found.text.append(f"    {chunk}" if indented else chunk)
@@ -76,7 +78,7 @@ def _parts(chunk: str, equation: bool, inner: re.Pattern[str]) -> list[str]:
     if equation:
         return [chunk]
     cuts = [0, *(match.end() for match in inner.finditer(chunk)), len(chunk)]
-    return [chunk[a:b] for a, b in zip(cuts, cuts[1:], strict=False)]
+    return [chunk[a:b] for a, b in pairwise(cuts)]
 
 
 def raised(docstring: str | None) -> str:
@@ -100,7 +102,7 @@ def as_rst(text: str) -> str:
     )  # fmt: skip
 
 
-def restructured(docstring: str, names: Collection[str], fields: bool = True) -> list[str]:
+def restructured(docstring: str, names: Collection[str]) -> list[str]:
     """The lines of a docstring as reStructuredText: equations as literal blocks, arguments as a list of fields."""
     found, lines, equation = read(docstring, names), [], False
     for chunk in found.text:
@@ -110,6 +112,5 @@ def restructured(docstring: str, names: Collection[str], fields: bool = True) ->
             lines += ["", as_rst(chunk), ""] if equation else [as_rst(chunk), ""]
         equation = chunk.startswith("    ")
     lines.append("")
-    role = "param" if fields else "ivar"
-    lines += [f":{role} {name}: {as_rst(meaning)}" for name, meaning in found.meanings.items()]
+    lines += [f":param {name}: {as_rst(meaning)}" for name, meaning in found.meanings.items()]
     return [*lines, ""]

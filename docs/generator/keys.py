@@ -76,9 +76,9 @@ def page() -> str:
 HEAD = """# Every key of a configuration
 
 Made from the dataclasses that are the configuration's schema: what is said here is what the program checks. Where the
-default is *needed* a file must have the key; a table without needed keys may be left out. `none` in a file switches off what
-has a default. [Other spellings](../configuration.md#other-ways-to-say-a-value) of angles, vectors, planes and media have a
-section of their own.
+default is *needed* a file must have the key; a table without needed keys may be left out. `none` in a file switches
+off what has a default. [Other spellings](../configuration.md#other-ways-to-say-a-value) of angles, vectors, planes and
+media have a section of their own.
 
 """
 

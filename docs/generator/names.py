@@ -28,7 +28,7 @@ def _module(module: str) -> str:
 def _directive(module: str, name: str) -> str:
     value = getattr(import_module(module), name)
     if inspect.isclass(value):
-        return f"autoclass:: {module}.{name}\n   :members:" + ("" if issubclass(value, BaseException) else "")
+        return f"autoclass:: {module}.{name}\n   :members:"
     if callable(value):
         return f"autofunction:: {module}.{name}"
     return f"autodata:: {module}.{name}\n   :no-value:"

@@ -23,8 +23,8 @@ images = image(volume, microscope, Acquisition([Prism((0.0, 0.24), math.pi / 2)]
 half = grid.extent[1] / 2
 figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
 for axis, plane, z in zip(axes, images[0], focus, strict=True):
-    shown = axis.imshow(plane, cmap="gray", vmin=0.2, vmax=0.8, extent=(-half, half, half, -half))
+    axis.imshow(plane, cmap="gray", vmin=0.2, vmax=0.8, extent=(-half, half, half, -half))
     axis.set(title=f"focus {z:g} µm", xlabel="x, µm")
 axes[0].set_ylabel("y, µm")
-figure.colorbar(shown, ax=axes, label="intensity, of the empty bright field")
+figure.colorbar(axes[0].images[0], ax=axes, label="intensity, of the empty bright field")
 plt.show()

@@ -1,8 +1,8 @@
 """The error of three propagations
 ===============================
 
-The field behind a bead is known exactly, as a sum of partial waves. Straight rays, bent rays and the wave are compared with
-it for beads of rising contrast; the error is the rms difference over the exact image's standard deviation.
+The field behind a bead is known exactly, as a sum of partial waves. Straight rays, bent rays and the wave are compared
+with it for beads of rising contrast; the error is the rms difference over the exact image's standard deviation.
 """
 
 import math

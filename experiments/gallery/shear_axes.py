@@ -1,8 +1,8 @@
 """One or two shear axes
 =====================
 
-A rod that lies along the shear has no edge across it: with one shear axis its image is nearly flat but at its ends. With a
-second shear, across the first, its sides show. Whatever is to be reconstructed in all directions wants two.
+A rod that lies along the shear has no edge across it: with one shear axis its image is nearly flat but at its ends.
+With a second shear, across the first, its sides show. Whatever is to be reconstructed in all directions wants two.
 """
 
 import math

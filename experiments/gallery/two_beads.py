@@ -1,8 +1,8 @@
 """Two beads, one above the other
 ==============================
 
-Light meets the lower bead first. A straight projection adds the paths of both into one plane between them, so that neither
-bead is sharp where it lies. The wave has each sharp in its own plane, and the other blurred.
+Light meets the lower bead first. A straight projection adds the paths of both into one plane between them, so that
+neither bead is sharp where it lies. The wave has each sharp in its own plane, and the other blurred.
 """
 
 import math
@@ -15,7 +15,8 @@ from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objecti
 
 grid = Grid(shape=(64, 64, 64), spacing=(0.125, 0.15, 0.15))
 beads = [Bead(1.6, 0.03, 1.56, centre=(-1.9, -0.5, -0.5)), Bead(1.6, 0.03, 1.56, centre=(1.9, 0.5, 0.5))]
-volume = Volume(grid, sum(bead.delta(grid, dtype=torch.float32) for bead in beads), 1.56)
+delta = torch.stack([bead.delta(grid, dtype=torch.float32) for bead in beads]).sum(0)
+volume = Volume(grid, delta, 1.56)
 microscope = Microscope(0.546, Objective(0.9), Condenser(0.7))
 acquisition = Acquisition([Prism((0.0, 0.24), math.pi / 2)], focus=[-1.9, 1.9])
 stacks = {name: image(volume, microscope, acquisition, Fidelity(name))[0] for name in ("projection", "wave")}
