@@ -23,7 +23,6 @@ project_copyright = f"{author}, BSD-3-Clause"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
 exclude_patterns = ["_build", "generator", "gallery/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
 myst_heading_anchors = 4
-smartquotes = False  # they make a dash of an option's two hyphens
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 python_maximum_signature_line_length = 88
@@ -32,6 +31,9 @@ python_use_unqualified_type_names = True
 html_theme = "pydata_sphinx_theme"
 html_title = "torchdic"
 html_theme_options = {"show_prev_next": True, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
+html_static_path, html_css_files = ["_static"], ["site.css"]
+# pages without others beside them have nothing to show there
+html_sidebars = {page: [] for page in ("install", "own_stack", "simulate", "reconstruct", "accuracy", "concepts")}
 html_show_sourcelink = False
 
 sphinx_gallery_conf = {

@@ -34,12 +34,13 @@ def test_every_key_of_a_resolved_configuration_is_in_the_reference():
                 assert key in told
 
 
-@pytest.mark.parametrize("section", [*FIELDS, *(type(f.default_factory()) for f in dataclasses.fields(Config)
-                                               if f.default_factory is not dataclasses.MISSING)])  # fmt: skip
-def test_every_key_of_a_section_is_in_the_reference(section):
+def test_every_key_of_a_section_is_in_the_reference():
+    made = [field.default_factory for field in dataclasses.fields(Config)]
+    sections = {*FIELDS, *(type(make()) for make in made if make is not dataclasses.MISSING)}
     page = keys.page()
-    for field in dataclasses.fields(section):
-        assert f"| `{field.name}` |" in page
+    for section in sections - {tuple}:
+        for field in dataclasses.fields(section):
+            assert f"| `{field.name}` |" in page
 
 
 def test_every_key_has_a_type_a_default_and_a_meaning():

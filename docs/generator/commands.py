@@ -1,6 +1,7 @@
 """Every command, with its arguments, from the parser that reads them."""
 
 import argparse
+import re
 
 from recon.cli.commands import COMMANDS, Command
 
@@ -51,4 +52,5 @@ def _called(action: argparse.Action) -> str:
 def _told(made: argparse.ArgumentParser, action: argparse.Action) -> str:
     told = made._get_formatter()._expand_help(action) if action.help else ""
     choices = f" ({', '.join(f'`{choice}`' for choice in action.choices)})" if action.choices else ""
-    return (told + choices).replace("|", "\\|")
+    options_as_code = re.sub(r"(?<![\w`-])(--[\w-]+)", r"`\1`", told)
+    return (options_as_code + choices).replace("|", "\\|")

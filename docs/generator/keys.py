@@ -95,9 +95,11 @@ def _tables(path: str, section: type) -> Iterator[Table]:
     for field in fields:
         meaning = _meaning(section, field.name)
         keys.append(Key(field.name, *_described(hints[field.name], field, meaning)))
-        below += [(f"{path}.{field.name}".lstrip("."), kind) for kind in _sections(hints[field.name])]
+        for kind in _sections(hints[field.name]):
+            below.append((f"{path}.{field.name}".lstrip(".") + ("[]" if kind is Candidate else ""), kind))
     if section is Acquisition:
-        below += [(f"{path}.prisms[]", kind) for kind in (Prism, *PRISMS.values())]
+        below += [(f"{path}.prisms[]", Prism)]
+        below += [(f"{path}.prisms[] (with {key})", kind) for key, kind in PRISMS.items()]
     text = read(section.__doc__, [field.name for field in fields]).text
     law = " ".join(law for kind in reversed(section.__mro__) if (law := raised(kind.__dict__.get("__doc__"))))
     further = FURTHER.get(section.__name__, ())
