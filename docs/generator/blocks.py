@@ -67,7 +67,7 @@ def blocks(page: Path) -> Iterator[tuple[str, str]]:
 
 def _shell(block: str) -> None:
     """Raise ValueError for a line that can't be what is meant."""
-    for line in block.splitlines():
+    for line in block.replace("\\\n", " ").splitlines():
         words = shlex.split(line, comments=True)
         if words[:1] == ["torchdic"] and words[1:2] != ["--help"]:
             _command(words[1], words[2:])
