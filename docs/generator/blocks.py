@@ -2,7 +2,7 @@
 
 Python runs, all blocks of a page in one namespace. TOML is parsed. Of a shell's lines `torchdic …` is read by the
 command's parser, `make …` must be a target, `python …` a file, and `torchdic[…]` an extra. A block in which "…" stands
-for something that is left out is no code.
+for something that is left out is no code, and Python in which "..." does is compiled alone.
 """
 
 import contextlib
@@ -47,7 +47,8 @@ def check(page: Path) -> None:
 
 def run_python(page: Path) -> None:
     """Run the Python of a page in a folder of its own. Raises what it raises."""
-    program = "\n".join(block for language, block in blocks(page) if language == "python")
+    whole = [block for language, block in blocks(page) if language == "python" and "..." not in block]
+    program = "\n".join(whole)
     if not program:
         return
     before = Path.cwd()
