@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-all test-view faults stability lint bench clean
+.PHONY: demo test test-all test-view faults stability lint bench docs clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -61,5 +61,12 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/on_gpu.py
 	$(BIN)/python benchmarks/performance_figure.py
 
+# warnings are errors: of links, of code blocks, of the gallery's scripts. Nothing is looked up on a network
+docs: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,docs]"
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
 clean:
+	rm -rf docs/_build docs/generated docs/gallery
 	rm -rf $(VENV) demo .pytest_cache .ruff_cache

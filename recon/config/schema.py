@@ -107,8 +107,9 @@ class DataSection:
         integer stacks, and takes floats as relative to the empty bright field.
     offset: counts that the camera gives in the dark.
     order: of the polynomial in (y, x) that is fitted to a background.
-    gain: counts per photoelectron, and read_noise: standard deviation in counts; they give each pixel its own noise.
-        None is one noise for each prism, as it was measured.
+    gain: counts per photoelectron; with read_noise it gives each pixel its own noise. None is one noise for each prism,
+        as it was measured.
+    read_noise: standard deviation in counts; it has a say beside gain.
     series: which stack of a file that holds several (series or positions), counted from 0; None for its only one.
     mask: a stack of any integers or floats, 0 where a pixel doesn't count: (y, x), (focus, y, x) or as the stack; a
         relative path starts from the configuration's folder. None is all pixels.

@@ -14,7 +14,10 @@ SHARPNESS = 200.0
 
 @dataclass(frozen=True)
 class Bounds:
-    """The least and the greatest Δn. None is no bound. Raises ValueError unless lower < upper.
+    """The least and the greatest Δn.
+
+    lower: the least Δn; None is no bound. upper: the greatest Δn; None is no bound.
+    Raises ValueError unless lower < upper.
 
     Δn is a smooth function of the parameter, not a clamped one: a voxel that is clamped at a bound has no gradient and
     can never leave it.

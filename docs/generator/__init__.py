@@ -1,0 +1,1 @@
+"""What the site's reference is made of: docstrings, the configuration's schema and the commands' parsers."""
