@@ -135,6 +135,14 @@ COMMANDS = {
         own=True,
         reported=False,
     ),
+    "completion": Command(
+        "recon.cli.shell.completion",
+        "print a script by which a shell completes commands, options and files",
+        "completion bash",
+        (),
+        own=True,
+        reported=False,
+    ),
     "work-precision": Command(
         "recon.cli.accuracy.work_precision",
         "measure what accuracy costs: the error of images, or of reconstructions, against seconds and memory",
@@ -231,8 +239,13 @@ class _Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{line}\n")
 
 
-def _parser(chosen: Command | None) -> argparse.ArgumentParser:
-    """The parser of all commands, with the arguments of the one that was chosen."""
+def whole_parser() -> argparse.ArgumentParser:
+    """The parser of all commands with all of their arguments, for which all their modules are imported."""
+    return _parser(*COMMANDS.values())
+
+
+def _parser(*chosen: Command | None) -> argparse.ArgumentParser:
+    """The parser of all commands, with the arguments of those that were chosen."""
     parser = _Parser(
         prog="torchdic",
         description="Simulate DIC images, and reconstruct the refractive-index volume behind measured ones.",
@@ -248,6 +261,6 @@ def _parser(chosen: Command | None) -> argparse.ArgumentParser:
             epilog=f"example: torchdic {command.example}",
             aliases=list(command.aliases),
         )
-        if command is chosen:
+        if command in chosen:
             command.add_arguments(below)
     return parser
