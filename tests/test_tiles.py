@@ -430,6 +430,15 @@ def test_tiles_of_another_run_are_not_gone_on_with(workplace, tmp_path, monkeypa
     assert "layout.json: can't be read" in err
 
 
+def test_a_run_by_tiles_in_place_of_a_whole_one_leaves_nothing_of_that(workplace, tmp_path):
+    out, other = tmp_path / "out", workplace / "uncut.toml"
+    other.write_text(CONFIG.replace("tiles = 25", "tiles = 'none'"), encoding="utf-8")
+    assert command("reconstruct", other, "--out", out)[0] == 0
+    assert {"log.csv", "checkpoint.pt"} <= set(content(out))
+    assert command("reconstruct", workplace / "a.toml", "--out", out, "--restart")[0] == 0
+    assert set(content(out)) == set(content(workplace / "whole"))
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -487,13 +496,13 @@ def test_a_field_without_room_is_cut_into_tiles_as_large_as_the_memory(field, tm
     found = {}
     for free in (12_000_000, 20_000_000):
         little_memory(free)
-        cut = cut_of(config, whole, GaussianMisfit, tmp_path, None)
+        cut = cut_of(config, whole, GaussianMisfit, None)
         assert cut is not None
         found[free] = cut.layout.side
         assert cut.memory <= free // 4
         assert cut.problem(whole).fidelity.fidelity.memory == cut.memory
     assert least_side(margin_of_tiles(config)) <= found[12_000_000] < found[20_000_000]
-    with_budget = cut_of(config, whole, GaussianMisfit, tmp_path, 6_000_000)  # as half of the first
+    with_budget = cut_of(config, whole, GaussianMisfit, 6_000_000)  # as half of the first
     assert with_budget is not None
     assert with_budget.layout.side == found[12_000_000]
 
@@ -501,16 +510,16 @@ def test_a_field_without_room_is_cut_into_tiles_as_large_as_the_memory(field, tm
 def test_without_room_for_the_smallest_tiles_a_field_is_refused(field, tmp_path, little_memory):
     little_memory(1_000_000)
     with pytest.raises(ShortOfMemoryError, match="Tiles of 24 voxels and 4 more on each side need at least"):
-        cut_of(configured(tmp_path), field[0], GaussianMisfit, tmp_path, None)
+        cut_of(configured(tmp_path), field[0], GaussianMisfit, None)
 
 
 def test_tiles_may_be_switched_off(field, tmp_path, little_memory):
     config = configured(tmp_path, tiles="none")
     little_memory(10**9)
     with pytest.raises(ShortOfMemoryError, match="no room"):
-        cut_of(config, field[0], GaussianMisfit, tmp_path, None)
+        cut_of(config, field[0], GaussianMisfit, None)
 
 
 def test_a_field_with_room_stays_whole(field, tmp_path):
-    assert cut_of(configured(tmp_path), field[0], GaussianMisfit, tmp_path, None) is None
-    assert cut_of(configured(tmp_path, tiles=64), field[0], GaussianMisfit, tmp_path, None) is None
+    assert cut_of(configured(tmp_path), field[0], GaussianMisfit, None) is None
+    assert cut_of(configured(tmp_path, tiles=64), field[0], GaussianMisfit, None) is None

@@ -29,7 +29,7 @@ from recon.run.folder.lock import when_done
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
-from recon.run.recorded import CHECKPOINT, STOPPING, descend_recorded, leave_stopped, tell_foreseen
+from recon.run.recorded import CHECKPOINT, LOG, STOPPING, descend_recorded, leave_stopped, tell_foreseen
 from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import (
     check_room_for_descent,
@@ -38,7 +38,7 @@ from recon.run.room import (
     check_room_for_volume,
 )
 from recon.run.tiles.fitting import TiledFit
-from recon.run.tiles.kept import TILES, forget
+from recon.run.tiles.kept import TILES, forget, remembered_side
 from recon.run.tiles.sizes import Cut, cut_of
 from torchdic import Fidelity
 from torchdic.memory.shortage import as_shortage
@@ -79,15 +79,15 @@ def reconstruct(
     start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
     if config.reconstruction.method in DIRECT:
         return _solved(config, measured, problem, out, identity)
-    if restart:
-        forget(out)
     cut = None
     if start is None:
-        cut = cut_of(config, problem, made, out, budget)
+        cut = cut_of(config, problem, made, budget, None if restart else remembered_side(out))
     else:  # a field of which a fit is under way stays whole
         check_room_for_descent(problem, made)
     _check_room_for_report(problem)
     prepare_folder(out)
+    if restart:
+        forget(out)
     if cut is not None:
         result = _in_tiles(config, measured, problem, cut, out, identity)
         warn_of_changes(config, before)
@@ -136,6 +136,8 @@ def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out:
         result = write_results(out, config, measured, problem, tiled.ended, tiled=tiled)
     except ResultsError as error:
         raise ResultsError(f"{error}{GO_ON}") from error
+    for name in (LOG, CHECKPOINT):  # of an earlier fit of the whole
+        (out / name).unlink(missing_ok=True)
     when_done(lambda: forget(out))
     return result
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from torch import Tensor
 
@@ -13,7 +12,6 @@ from recon.fit.problem import Problem
 from recon.misfit.base import Misfit
 from recon.recording.cut_field import margin_beyond
 from recon.run.room import check_room_for_descent, held_beside_images
-from recon.run.tiles.kept import remembered_side
 from recon.tiling.layout import Layout
 from recon.tiling.part import without_margin
 from torchdic import ShortOfMemoryError, foreseen
@@ -45,18 +43,21 @@ class Cut:
 
 
 def cut_of(
-    config: Config, problem: Problem, misfit: Callable[[Tensor], Misfit], out: Path, budget: int | None
+    config: Config,
+    problem: Problem,
+    misfit: Callable[[Tensor], Misfit],
+    budget: int | None,
+    remembered: tuple[int, int] | None = None,
 ) -> Cut | None:
     """How a field is cut into tiles; None where it is fitted whole.
 
-    config: spelled out. problem: of the whole field. misfit: makes the problem's from data. out: folder of the results,
-    whose tiles, if some are fitted, are gone on with. budget: bytes that a tile's descent may take where the
-    configuration gives them; None is half of what is free.
+    config: spelled out. problem: of the whole field. misfit: makes the problem's from data. budget: bytes that a tile's
+    descent may take where the configuration gives them; None is half of what is free. remembered: side and memory of
+    tiles that are gone on with; None begins anew.
     Raises ConfigError for tiles that are too small; ShortOfMemoryError where the field has no room and isn't to be cut,
-    or its tiles have none; and CheckpointError where what the tiles in the folder are can't be read.
+    or its tiles have none.
     """
     tiles, margin, memory = config.reconstruction.tiles, margin_of_tiles(config), _memory(problem)
-    remembered = remembered_side(out)
     if remembered is not None:
         return Cut(_layout(problem, remembered[0], margin), remembered[1])
     longest = max(problem.setup.field.shape[1:])
