@@ -6,7 +6,7 @@ and where in the model's setup the quantity goes. `Unknowns` are the unknowns of
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.fit.bounds import Bounds
+from recon.fit.bounds import Bounds, SupportedBounds
 from recon.fit.setup import Setup
 from recon.fit.start import linear_start
 from recon.misfit.base import Misfit
@@ -98,6 +98,16 @@ def _linear(setup: Setup, misfit: Misfit) -> Tensor:
     microscope = setup.microscope if setup.sees_voxels else replace(setup.microscope, camera=None)
     delta = linear_start(data, setup.field, setup.volume.background, microscope, setup.acquisition)
     return delta if margin == 0 else F.pad(delta[None], (margin,) * 4, mode="replicate")[0]
+
+
+def with_support(unknown: Unknown, change: Callable[[Tensor], Tensor]) -> Unknown:
+    """An unknown with its support changed; itself where it isn't Δn or Δn is sought everywhere.
+
+    change: makes the new support (z, y, x) of the old one.
+    """
+    if not isinstance(unknown, IndexDifference) or not isinstance(unknown.bounds, SupportedBounds):
+        return unknown
+    return replace(unknown, bounds=replace(unknown.bounds, support=change(unknown.bounds.support)))
 
 
 def with_values(unknowns: Sequence[Unknown], values: Mapping[str, Tensor], setup: Setup) -> Setup:

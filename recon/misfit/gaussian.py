@@ -38,9 +38,11 @@ class GaussianMisfit(Misfit):
         model = noise.like(self.data)
         level, number = neighbours(self.data, self.mask)
         variance = model.variance(torch.maximum(level, model.gain))
-        empty = image_means(self.data, self.mask, 1 / variance)
-        own = self.mean((self.data - empty).square() / variance)
-        self._empty = unit._empty if isinstance(unit, GaussianMisfit) else own
+        if isinstance(unit, GaussianMisfit):
+            self._empty = unit._empty
+        else:
+            empty = image_means(self.data, self.mask, 1 / variance)
+            self._empty = self.mean((self.data - empty).square() / variance)
         self._divisor = variance * self._empty
         # the mean of 1/variance is a little more than 1 over the mean, because the neighbours are noisy too
         scatter = model.gain.square() * model.variance(level) / number.clamp_min(1)

@@ -43,9 +43,11 @@ class PoissonMisfit(Misfit):
         self._read = (self._model.read / self._model.gain).square()
         self._darkest = self._read.clamp_min(_DARKEST)
         self._counts = self._photons(self.data)
-        uniform = image_means(self.data, self.mask).expand_as(self.data)
-        empty = deviance(self._counts, self._photons(uniform), self._darkest)
-        self._empty = unit._empty if isinstance(unit, PoissonMisfit) else self.mean(empty)
+        if isinstance(unit, PoissonMisfit):
+            self._empty = unit._empty
+        else:
+            uniform = image_means(self.data, self.mask).expand_as(self.data)
+            self._empty = self.mean(deviance(self._counts, self._photons(uniform), self._darkest))
 
     def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "PoissonMisfit":
         """The misfit of a part of the images, see `Misfit.part`."""

@@ -30,7 +30,7 @@ from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, LOG, STOPPING, descend_recorded, leave_stopped, tell_foreseen
-from recon.run.results import INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
+from recon.run.results import GO_ON, INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import (
     check_room_for_descent,
     check_room_for_direct,
@@ -48,9 +48,6 @@ from torchdic.memory.shortage import as_shortage
 # the error of a first-order split step is below that of its directions and of the voxels.
 RECOMMENDED = Fidelity("wave", sources=128, padding=8)
 RECOMMENDED_FOR_ADAM = Fidelity("wave", order=1)
-
-# What ends a message about results that can't be written.
-GO_ON = "; make room and go on with --resume"
 
 # Pixels along a side of a field that is too small to tell whether the specimen goes on beyond it.
 LEAST_FIELD = 24

@@ -37,6 +37,10 @@ IMAGES = "images.ome.tif"
 INTERRUPTED = "volume.interrupted.ome.tif"
 
 
+# What ends a message about results that can't be written, where a run can go on.
+GO_ON = "; make room and go on with --resume"
+
+
 class ResultsError(ValueError):
     """Results cannot be written: one line with the files and the reason."""
 

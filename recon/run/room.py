@@ -11,7 +11,7 @@ from torch import Tensor
 from recon.earlier.path_length import path_length
 from recon.earlier.tikhonov import MEMORY as MEMORY_OF_LINEAR
 from recon.earlier.tikhonov import tikhonov
-from recon.fit.bounds import Bounds, SupportedBounds
+from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.newton.correction import drafts
 from recon.fit.newton.descent import COARSE_STEPS
@@ -21,7 +21,7 @@ from recon.fit.newton.weak_hessian import weak_responses
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
-from recon.fit.unknowns import IndexDifference, Unknown
+from recon.fit.unknowns import Unknown, with_support
 from recon.misfit.base import Misfit
 from recon.prior.weight import FollowsNoise
 from torchdic import Fidelity, Grid, Microscope, Volume, foreseen, image
@@ -70,14 +70,13 @@ def bytes_held(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:
     misfit: makes the problem's misfit from data. Where no fidelity is planned yet, they are those of its first steps.
     """
     setup, careful = problem.setup, problem.fidelity.coarse
-    scene, learned, others = (setup.volume, setup.microscope, setup.acquisition), careful, [0]
-    responses = 0
-    if problem.method == "newton":  # gradients are those of drafts, and careful images have none
-        _, learned = drafts(careful, problem.fidelity.draft_sources)
-        others.append(foreseen(*scene, careful, gradient=False).peak)
-        responses = _bytes_of_responses(problem, learned, careful)
-    images = max(foreseen(*scene, learned, gradient=True).peak, *others)
-    return max(images + held_beside_images(problem, misfit, careful), responses)
+    scene, beside = (setup.volume, setup.microscope, setup.acquisition), held_beside_images(problem, misfit, careful)
+    if problem.method != "newton":
+        return foreseen(*scene, careful, gradient=True).peak + beside
+    # gradients are those of drafts, and careful images have none
+    _, draft = drafts(careful, problem.fidelity.draft_sources)
+    images = max(foreseen(*scene, draft, gradient=True).peak, foreseen(*scene, careful, gradient=False).peak)
+    return max(images + beside, _bytes_of_responses(problem, draft, careful))
 
 
 def _bytes_of_responses(problem: Problem, draft: Fidelity, careful: Fidelity) -> int:
@@ -195,9 +194,7 @@ def _sample(setup: Setup, microscope: Microscope, dtype: torch.dtype) -> tuple[S
 
 def _of_shape(unknown: Unknown, shape: tuple[int, int, int]) -> Unknown:
     """An unknown with a support, if it has one, of another shape."""
-    if not isinstance(unknown, IndexDifference) or not isinstance(unknown.bounds, SupportedBounds):
-        return unknown
-    return replace(unknown, bounds=replace(unknown.bounds, support=torch.ones(shape, dtype=torch.bool)))
+    return with_support(unknown, lambda _: torch.ones(shape, dtype=torch.bool))
 
 
 def _of_one_source(microscope: Microscope) -> Microscope:

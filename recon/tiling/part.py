@@ -12,13 +12,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from recon.fit.bounds import SupportedBounds
 from recon.fit.newton.descent import known_contrast
 from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
-from recon.fit.unknowns import IndexDifference, Unknown
+from recon.fit.unknowns import IndexDifference, Unknown, with_support
 from recon.misfit.base import Misfit
 from recon.misfit.level import image_means
 from recon.prior.weight import FollowsNoise
@@ -65,12 +64,8 @@ def without_margin(problem: Problem) -> Problem:
     if setup.margin == 0:
         return problem
 
-    def within(unknown: Unknown) -> Unknown:
-        support = _support(unknown)
-        return unknown if support is None else _supported(unknown, setup.within_field(support))
-
     medium = empty_medium(setup.field, float(setup.volume.background), setup.volume.delta)
-    unknowns = [within(unknown) for unknown in problem.unknowns]
+    unknowns = [with_support(unknown, setup.within_field) for unknown in problem.unknowns]
     return replace(problem, setup=replace(setup, volume=medium, margin=0), unknowns=unknowns)
 
 
@@ -99,7 +94,8 @@ def problem_of_tile(
     # given weights of the priors are relative to the scale of the whole
     unit = whole.misfit if whole.weight is None else None if shared is None else shared.misfit
     misfit = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
-    setup, unknowns = _setup(whole.setup, layout), [_in_tile(u, layout, tile) for u in whole.unknowns]
+    setup = _setup(whole.setup, layout)
+    unknowns = [with_support(u, lambda support: _with_margin(support, tile, layout.margin)) for u in whole.unknowns]
     if shared is not None:
         for unknown in unknowns:
             if not _is_of_tile(unknown):
@@ -138,24 +134,6 @@ def _setup(whole: Setup, layout: Layout) -> Setup:
         field.widened(layout.margin, layout.margin), float(whole.volume.background), whole.volume.delta
     )
     return replace(whole, volume=medium, margin=layout.margin)
-
-
-def _support(unknown: Unknown) -> Bool[Tensor, "z y x"] | None:
-    """The voxels in which Δn is sought, if the unknown is Δn and they aren't all."""
-    bounds = unknown.bounds if isinstance(unknown, IndexDifference) else None
-    return bounds.support if isinstance(bounds, SupportedBounds) else None
-
-
-def _supported(unknown: Unknown, support: Bool[Tensor, "z y x"]) -> Unknown:
-    """Δn with another support."""
-    assert isinstance(unknown, IndexDifference)
-    return replace(unknown, bounds=SupportedBounds(unknown.bounds.lower, unknown.bounds.upper, support))
-
-
-def _in_tile(unknown: Unknown, layout: Layout, tile: Tile) -> Unknown:
-    """An unknown whose support, if it has one, is the tile's."""
-    support = _support(unknown)
-    return unknown if support is None else _supported(unknown, _with_margin(support, tile, layout.margin))
 
 
 def _with_margin(support: Bool[Tensor, "z y x"], tile: Tile, margin: int) -> Bool[Tensor, "z row column"]:

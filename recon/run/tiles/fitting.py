@@ -19,7 +19,7 @@ from recon.run.checkpoint import Checkpoint
 from recon.run.folder.prepared import keep_folder
 from recon.run.interruption import InterruptedRunError
 from recon.run.recorded import STOPPING, descend_recorded, tell_foreseen
-from recon.run.results import ResultsError, Tiled, leave_interrupted, model_images
+from recon.run.results import GO_ON, ResultsError, Tiled, leave_interrupted, model_images
 from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept, prepared, remember_side
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
@@ -192,7 +192,7 @@ def _told() -> Iterator[None]:
     try:
         yield
     except WriteError as error:
-        raise ResultsError(f"{error}; make room and go on with --resume") from error
+        raise ResultsError(f"{error}{GO_ON}") from error
 
 
 def _fit_share(fit: TiledFit, tiles: Sequence[Tile], forecast: Forecast) -> None:
