@@ -75,6 +75,19 @@ def test_careful_steps_are_known_to_take_longer_before_the_first_of_them():
     assert fine > coarse
 
 
+def test_a_specimen_in_which_few_directions_mislead_is_foreseen_to_take_longer(monkeypatch):
+    def foreseen(misled):
+        monkeypatch.setattr(forecast_room, "timed", lambda run, repeats, _: [run() or 2.0] * repeats)
+        monkeypatch.setattr(forecast_room, "expected_misled", lambda _: misled)
+        forecast = Forecast(problem(steps=20))
+        return forecast.whole(), [forecast.cost(number) for number in range(20)]
+
+    (usual, costs), (longer, costs_of_all) = foreseen(False), foreseen(True)
+    assert costs[:COARSE_STEPS] == costs_of_all[:COARSE_STEPS]
+    assert all(more > less for less, more in zip(costs[COARSE_STEPS:], costs_of_all[COARSE_STEPS:], strict=True))
+    assert longer > 1.3 * usual
+
+
 def test_a_kind_of_step_that_was_seen_is_known_by_its_own_seconds():
     forecast = Forecast(problem(method="adam", steps=10, draft_sources=8))
     for number in range(1, 9):  # the last four steps take all directions, here no longer than the others

@@ -14,7 +14,7 @@ from distant import DISTANT, Device, bring, send
 from recon.fit.bounds import Bounds
 from recon.fit.descent import minimise
 from recon.fit.newton.correction import REST, Correction, drafts
-from recon.fit.newton.descent import COARSE_STEPS, CREEP, _Descent, minimise_by_newton
+from recon.fit.newton.descent import COARSE_STEPS, CREEP, _Descent, expected_misled, minimise_by_newton
 from recon.fit.nuisances.light import Brightness
 from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
@@ -476,6 +476,7 @@ def test_few_directions_are_given_up_where_they_mislead(monkeypatch, height, mis
     delta, careful = bead(height, radius=1.0), Fidelity(sources=72)
     setup = setup_of(delta)
     data, _ = recorded(setup, 0.1, careful)
+    assert expected_misled(problem_of(data, setup, Recipe(draft_sources=8), careful)) is misled
     steps = fitted(data, setup, Recipe(draft_sources=8), careful)
     assert steps[-1].state["newton"]["misled"] is misled
     if misled:
@@ -483,6 +484,16 @@ def test_few_directions_are_given_up_where_they_mislead(monkeypatch, height, mis
         assert by_all.weights[-1]["tv"] == by_all.weights[-2]["tv"]  # of wrong images, it waits
         monkeypatch.setattr("recon.fit.newton.descent.ASTRAY", math.inf)
         assert error(steps, delta) < 0.9 * error(fitted(data, setup, Recipe(draft_sources=8), careful), delta)
+
+
+@pytest.mark.parametrize("height", [0.01, 0.08])
+def test_few_directions_are_not_expected_to_mislead_where_the_specimen_is_weak(height):
+    """At 0.08 the light's phase is no longer small, and it is the estimate's images that say so."""
+    careful = Fidelity(sources=72)
+    setup = setup_of(bead(height, radius=1.0))
+    data, _ = recorded(setup, 0.1, careful)
+    assert not expected_misled(problem_of(data, setup, Recipe(draft_sources=8), careful))
+    assert not expected_misled(problem_of(data, setup, Recipe(draft_sources=None), careful))
 
 
 def test_a_descent_goes_on_from_a_given_volume(scene, plain):

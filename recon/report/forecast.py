@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from recon.fit.newton.correction import drafts
-from recon.fit.newton.descent import COARSE_STEPS
+from recon.fit.newton.descent import COARSE_STEPS, expected_misled
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from torchdic import Acquisition, Fidelity, Microscope, Volume
@@ -42,7 +42,7 @@ class Forecast:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._trial: float | None = None
-        self._costs = [_cost(problem, number) for number in range(problem.steps)]
+        self._costs = _costs(problem)
         self._last: deque[tuple[float, float]] = deque(maxlen=LAST)
         self._of_kind: dict[float, deque[float]] = {}
 
@@ -68,6 +68,8 @@ class Forecast:
         """
         if self.untried and (first := _first(self._problem)) is not None:
             self._trial = _trial(self._problem, first) / (WITH_GRADIENT * work(first, *_scene(self._problem)))
+            if _expected_misled(self._problem):
+                self._costs = _costs(self._problem, misled=True)
         usual = USUAL_STEPS if self._problem.method == "newton" else len(self._costs)
         rate = self._rate()
         return None if rate is None else rate * sum(self._costs[number : max(usual, number + 1)])
@@ -132,8 +134,22 @@ def _careful(problem: Problem) -> Fidelity | None:
     return problem.fidelity.fidelity if isinstance(problem.fidelity, GivenFidelity) else None
 
 
-def _cost(problem: Problem, number: int) -> float:
-    """What a step costs, in the work of its images; number: counted from 0."""
+def _expected_misled(problem: Problem) -> bool:
+    """Whether Newton's later steps will probably have all directions, for few mislead."""
+    if problem.method != "newton" or problem.steps <= COARSE_STEPS or _careful(problem) is None:
+        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the descent's own images will warn
+        return expected_misled(problem)
+
+
+def _costs(problem: Problem, misled: bool = False) -> list[float]:
+    """What each step costs, in the work of its images. misled: whether few directions mislead Newton's later steps."""
+    return [_cost(problem, number, misled) for number in range(problem.steps)]
+
+
+def _cost(problem: Problem, number: int, misled: bool) -> float:
+    """What a step costs, see `_costs`; number: counted from 0."""
     setup, scene = problem.setup, _scene(problem)
     careful = _careful(problem)
     if problem.method == "adam":
@@ -143,6 +159,8 @@ def _cost(problem: Problem, number: int) -> float:
         return WITH_GRADIENT * work(fidelity, *scene)
     careful = careful or problem.fidelity.coarse
     coarse, fine = drafts(careful, problem.fidelity.draft_sources)
+    if misled:
+        _, fine = drafts(careful, None)
     draft = coarse if number < COARSE_STEPS else fine
     each = work(draft, *scene)
     cost = WITH_GRADIENT * each + MODEL * each / directions(scene[1], draft.sources)

@@ -58,8 +58,11 @@ COARSE_STEPS = 4
 # ADMM's penalty on differences, over the weight: 1/(this share of the width of an edge).
 PENALTY = 0.4
 
-# Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast.
-TIKHONOV = 0.03
+# Tikhonov's weight over the Hessian's mean, in the volume that gives the first contrast; and in a smoother one, whose
+# noise few directions don't miss as if it were the specimen.
+TIKHONOV, SMOOTH = 0.03, 0.1
+# Phase along the light, in rad, up to which a specimen is so weak that few directions don't mislead.
+WEAK = 1.0
 
 # Where the renewed correction makes a step raise the objective by more than this share, the step is taken back too:
 # draft images lead astray there.
@@ -152,6 +155,14 @@ def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator
     FloatingPointError where the first volume has no images.
     """
     yield from _Descent(problem).steps(resume)
+
+
+def expected_misled(problem: Problem) -> bool:
+    """Whether few directions will probably mislead a problem's descent, by a linear estimate. Its fidelity is given.
+
+    It costs about half a step, and two for a specimen that isn't weak. Raises as `minimise_by_newton` does.
+    """
+    return _Descent(problem).expected_misled()
 
 
 class _Descent:
@@ -359,11 +370,35 @@ class _Descent:
         if given is not None and (scale := contrast(delta)) > 0:
             place = replace(place, scale=scale, weight=self.first_weight(scale), known=True, width=1.0)
             return place, hessian, now
-        inverse = hessian.inverse(0.0, TIKHONOV * hessian.mean)
-        linear = delta + hessian.solved(inverse, -now.gradient * self.voxels)
+        linear = self.linear(place, hessian, now, TIKHONOV)
         scale = contrast(self.bounds.clamped(linear))
         scale = max(scale, contrast(linear) * 1e-3, 1e-9)
         return replace(place, scale=scale, weight=self.first_weight(scale)), hessian, now
+
+    def linear(self, place: Place, hessian: WeakHessian, now: Judged, weight: float) -> Float[Tensor, "z y x"]:
+        """The volume that fits best if the specimen is weak. weight: Tikhonov's, over the Hessian's mean."""
+        inverse = hessian.inverse(0.0, weight * hessian.mean)
+        return place.delta + hessian.solved(inverse, -now.gradient * self.voxels)
+
+    def expected_misled(self) -> bool:
+        """See the function of this name."""
+        fidelity = self.problem.fidelity
+        careful = fidelity.last(())
+        (first, _), (_, fine) = (drafts(each, fidelity.draft_sources) for each in (fidelity.coarse, careful))
+        if self.index.given is not None or fine.sources >= careful.sources:
+            return False
+        place, hessian, now = self.start(first, None)
+        delta = self.bounds.clamped(self.linear(place, hessian, now, SMOOTH)).detach()
+        path = float(delta.sum(0).abs().max()) * self.problem.setup.volume.grid.spacing[0]
+        if 2 * math.pi * path / self.problem.setup.microscope.wavelength < WEAK:
+            return False
+        self.responses(place.responding, fine, careful)
+        place = replace(place, delta=delta)
+        try:
+            with torch.no_grad():
+                return self.leads_astray(self.corrected(place, self.formed(place, fine), careful))
+        except NO_IMAGES:  # so strong is the estimate
+            return True
 
     def first_weight(self, scale: float) -> float:
         """The priors' weight at first, for a specimen of a contrast."""
