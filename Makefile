@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-all test-view faults stability lint bench docs clean
+.PHONY: demo test test-all test-view test-install faults stability lint bench docs clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -30,6 +30,25 @@ test-all: $(INSTALLED)
 test-view: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev,view]"
 	$(BIN)/python -m pytest tests/test_view.py tests/test_makers.py
+
+# sdist and wheel, and the wheel in a fresh environment of each of these, away from the checkout
+PYTHONS ?= python3.11 python3.12 python3.13
+
+test-install: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt build
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist
+	@set -e; for python in $(PYTHONS); do \
+		$$python -m venv --clear dist/venv; \
+		dist/venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
+		( cd dist; set -x; export OMP_NUM_THREADS=1; \
+			venv/bin/python --version; \
+			venv/bin/python -m torchdic --help > help.txt; \
+			venv/bin/python -c "import data_synthetic, recon, torchdic; [open(p.__path__[0] + '/py.typed') for p in (data_synthetic, recon, torchdic)]"; \
+			venv/bin/torchdic completion bash > completion.bash; \
+			venv/bin/torchdic doctor; \
+			venv/bin/torchdic demo --out demo --restart ); \
+	done
 
 # disks that fill are small ones of their own: to mount them takes root's rights, or a namespace in which one has them
 faults: $(INSTALLED)
@@ -69,4 +88,4 @@ docs: $(INSTALLED)
 
 clean:
 	rm -rf docs/_build docs/generated docs/gallery
-	rm -rf $(VENV) demo .pytest_cache .ruff_cache
+	rm -rf $(VENV) demo dist .pytest_cache .ruff_cache
