@@ -1,0 +1,38 @@
+"""Calibrating with a bead
+=======================
+
+A bead of known size and index tells the optics behind its noisy images: here the bias, the length of the shear and the
+condenser's aperture, all told wrongly by 14 %. What is found lies within one standard deviation of the truth. Bias and
+length are known less well than the aperture, because both grown together change the images little.
+"""
+
+import matplotlib.pyplot as plt
+import torch
+
+from data_synthetic import Bead
+from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
+from recon.calibration.part import part_of
+from recon.run.exact_images import exact_images
+from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism
+
+grid, bead, focus = Grid((10, 36, 36), (0.3, 0.17, 0.17)), Bead(1.5, 0.06, 1.52), [-2.0, 0.0, 2.0]
+true = Acquisition([Prism((0.0, 0.22), bias) for bias in (1.4, -1.4)], focus)
+told = Acquisition([Prism((0.0, 0.25), bias) for bias in (1.6, -1.6)], focus)
+noiseless = exact_images(bead, grid, Microscope(0.546, Objective(0.9), Condenser(0.7)), true, Fidelity(sources=128))
+data = Camera(photons=5000).record(noiseless.float(), torch.Generator().manual_seed(0))
+part = part_of(data, None, grid)
+specimen = ModelledSpecimen(lambda voxels: bead.delta(voxels, dtype=torch.float32), height=3.0, width=3.0)
+model = model_of(part, specimen, bead.background, Microscope(0.546, Objective(0.9), Condenser(0.6)))
+found = find_optics(part, model, told, noise=[0.01, 0.01])
+
+wrong = {"bias": 1.6 / 1.4, "shear's length": 0.25 / 0.22, "condenser's NA": 0.6 / 0.7}  # told, over the true value
+bias, factor, aperture = found.values["bias"][0], found.values["shear"][0, 0], found.values["condenser"]
+right = [float(bias) / 1.4, float(factor) * wrong["shear's length"], float(aperture) * wrong["condenser's NA"]]
+sure = [found.deviations["bias"][0] / 1.4, found.deviations["shear"][0, 0], found.deviations["condenser"]]
+figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
+axis.axhline(1, color="gray", label="true")
+axis.plot(wrong.keys(), wrong.values(), "C1s", label="told")
+axis.errorbar(wrong.keys(), right, sure, fmt="C0o", capsize=4, label="found, with its standard deviation")
+axis.set(ylabel="over the true value", xlim=(-0.5, 2.5))
+axis.legend()
+plt.show()
