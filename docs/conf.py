@@ -12,8 +12,9 @@ DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS))
 sys.path.insert(0, str(DOCS.parent))  # a checkout's packages go before installed ones
 os.environ["OMP_NUM_THREADS"] = os.environ.get("OMP_NUM_THREADS", "1")
+os.environ["TQDM_DISABLE"] = "1"  # bars of progress are no output of the gallery's scripts
 
-from generator import blocks, commands, keys, names  # noqa: E402
+from generator import blocks, commands, gallery, keys, names, notebooks  # noqa: E402
 from generator.autodoc import describe  # noqa: E402
 
 import torchdic  # noqa: E402
@@ -21,7 +22,7 @@ import torchdic  # noqa: E402
 project, author, release = "torchdic", "The torchdic developers", torchdic.__version__
 project_copyright = f"{author}, BSD-3-Clause"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
-exclude_patterns = ["_build", "generator", "gallery/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
+exclude_patterns = ["_build", "generator", "gallery/**/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
 myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
@@ -37,10 +38,12 @@ html_sidebars = {page: [] for page in ("install", "own_stack", "simulate", "reco
 html_show_sourcelink = False
 
 sphinx_gallery_conf = {
-    "examples_dirs": str(DOCS.parent / "experiments" / "gallery"),
+    "examples_dirs": str(gallery.SCRIPTS),
     "gallery_dirs": "gallery",
-    "filename_pattern": r"\.py$",
-    "within_subsection_order": "FileNameSortKey",
+    "copyfile_regex": r"index\.rst",
+    "filename_pattern": gallery.runs(os.environ.get(gallery.DATA)),
+    "minigallery_sort_order": "generator.gallery.place",
+    "backreferences_dir": "generated/examples",
     "abort_on_example_error": True,
     "show_memory": False,
     "write_computation_times": False,
@@ -62,4 +65,5 @@ def setup(app) -> None:
     """What Sphinx calls before it reads the pages."""
     app.connect("builder-inited", make_reference, priority=100)
     app.connect("builder-inited", blocks.check_all, priority=200)
+    app.connect("builder-inited", notebooks.execute_all, priority=900)  # after sphinx-gallery, which makes them
     app.connect("autodoc-process-docstring", describe)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -19,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 sys.path.insert(0, str(DOCS))
 
-from generator import blocks, commands, docstrings, keys, names  # noqa: E402
+from generator import blocks, commands, docstrings, gallery, keys, names  # noqa: E402
 
 # Made with the site.
 MADE = ("generated/", "gallery/")
@@ -127,3 +128,34 @@ def test_a_block_that_cannot_be_used_is_refused(language, block, tmp_path):
     page.write_text(f"```{language}\n{block}\n```\n", encoding="utf-8")
     with pytest.raises(blocks.BlockError, match=r"nothing\.md"):
         blocks.check(page)
+
+
+SCRIPTS = sorted(gallery.SCRIPTS.glob("*.py"))
+MOST_LINES = 40
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_script_of_the_gallery_has_at_most_40_lines(script):
+    lines = len(script.read_text(encoding="utf-8").splitlines())
+    assert lines <= MOST_LINES, f"{script.name}: {lines} lines"
+
+
+def test_every_script_of_the_gallery_is_listed_as_a_picture_and_in_the_same_order_as_a_page():
+    pictures = re.findall(r"^   \.\./experiments/gallery/(\w+)\.py$", gallery.PAGE, re.MULTILINE)
+    pages = re.findall(r"^   (\w+)$", gallery.PAGE, re.MULTILINE)
+    assert pictures == pages
+    assert sorted(pictures) == [script.stem for script in SCRIPTS]
+    assert sorted(SCRIPTS, key=gallery.place) == [gallery.SCRIPTS / f"{name}.py" for name in pictures]
+
+
+def test_scripts_of_measured_data_run_where_there_are_some():
+    run = {data: {s.stem for s in SCRIPTS if re.search(gallery.runs(data), str(s))} for data in (None, "data")}
+    assert run["data"] == {script.stem for script in SCRIPTS}
+    assert run["data"] - run[None] == {"agar_beads", "hl60"}
+
+
+@pytest.mark.parametrize("name", ["agar_beads", "hl60"])
+def test_a_script_without_its_measured_data_says_so(name, monkeypatch):
+    monkeypatch.delenv("TORCHDIC_DATA", raising=False)
+    with pytest.raises(SystemExit, match=rf"^{name}\.py: TORCHDIC_DATA must name the folder"):
+        runpy.run_path(str(gallery.SCRIPTS / f"{name}.py"))

@@ -25,14 +25,14 @@ specimen = ModelledSpecimen(lambda voxels: bead.delta(voxels, dtype=torch.float3
 model = model_of(part, specimen, bead.background, Microscope(0.546, Objective(0.9), Condenser(0.6)))
 found = find_optics(part, model, told, noise=[0.01, 0.01])
 
-wrong = {"bias": 1.6 / 1.4, "shear's length": 0.25 / 0.22, "condenser's NA": 0.6 / 0.7}  # told, over the true value
-bias, factor, aperture = found.values["bias"][0], found.values["shear"][0, 0], found.values["condenser"]
-right = [float(bias) / 1.4, float(factor) * wrong["shear's length"], float(aperture) * wrong["condenser's NA"]]
-sure = [found.deviations["bias"][0] / 1.4, found.deviations["shear"][0, 0], found.deviations["condenser"]]
+names, wrong = ["bias", "shear's length", "condenser's NA"], [1.6 / 1.4, 0.25 / 0.22, 0.6 / 0.7]
+value, sure = found.values, found.deviations  # of length and NA: factors, and deviations of their logarithms
+right = [float(value["bias"][0]) / 1.4, float(value["shear"][0, 0]) * wrong[1], float(value["condenser"]) * wrong[2]]
+bars = [float(sure["bias"][0]) / 1.4, float(sure["shear"][0, 0]), float(sure["condenser"])]
 figure, axis = plt.subplots(figsize=(6.5, 4), layout="constrained")
 axis.axhline(1, color="gray", label="true")
-axis.plot(wrong.keys(), wrong.values(), "C1s", label="told")
-axis.errorbar(wrong.keys(), right, sure, fmt="C0o", capsize=4, label="found, with its standard deviation")
+axis.plot(names, wrong, "C1s", label="told")
+axis.errorbar(names, right, bars, fmt="C0o", capsize=4, label="found, with its standard deviation")
 axis.set(ylabel="over the true value", xlim=(-0.5, 2.5))
 axis.legend()
 plt.show()

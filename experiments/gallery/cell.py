@@ -28,13 +28,13 @@ truth, (depth, height, width) = cell.delta(grid), (side / 2 for side in grid.ext
 across, along = (-width, width, height, -height), (-width, width, -depth, depth)
 figure, axes = plt.subplots(2, 3, figsize=(10, 5.6), layout="constrained", sharex=True)
 for axis, shown, shear in zip(axes[:, 0], data[:, 4], "xy", strict=True):
-    recorded = axis.imshow(shown, cmap="gray", vmin=0.2, vmax=0.8, extent=across)
+    axis.imshow(shown, cmap="gray", vmin=0.2, vmax=0.8, extent=across)
     axis.set(title=f"focus 0 µm, shear along {shear}", xlabel="x, µm", ylabel="y, µm")
 for column, delta, name in zip(axes.T[1:], (truth, last.delta), ("truth", "found"), strict=True):
     column[0].imshow(delta[7], vmin=0, vmax=0.05, extent=across)  # across z through the nucleus
-    found = column[1].imshow(delta[:, 33], vmin=0, vmax=0.05, extent=along, origin="lower")
+    column[1].imshow(delta[:, 33], vmin=0, vmax=0.05, extent=along, origin="lower")
     for axis, title, down in zip(column, ("z = −0.6 µm", "y = 0.6 µm"), "yz", strict=True):
         axis.set(title=f"{name}, {title}", xlabel="x, µm", ylabel=f"{down}, µm")
-figure.colorbar(recorded, ax=axes[:, 0], label="of the empty bright field")
-figure.colorbar(found, ax=axes[:, 1:], label="Δn")
+figure.colorbar(axes[0, 0].images[0], ax=axes[:, 0], label="of the empty bright field")
+figure.colorbar(axes[0, 1].images[0], ax=axes[:, 1:], label="Δn")
 plt.show()

@@ -36,5 +36,5 @@ for axis, at, name, line in ((axes[0], 2, "x", (7, 21)), (axes[1], 0, "z", (slic
     axis.errorbar(place, bars.delta[line], bars.total[line], fmt="C0.", label="found, with its whole bar")
     axis.errorbar(place, bars.delta[line], bars.deviation[line], fmt="C1", linestyle="", linewidth=4, label="by noise")
     axis.set(xlabel=f"{name}, µm", ylabel="Δn", title=f"a line along {name}")
-axes[1].legend(loc="lower center")
+axes[0].legend(loc="center")
 plt.show()

@@ -28,9 +28,9 @@ law = torch.sin((bias + phase.roll(-pixel, 1) - phase.roll(pixel, 1)) / 2).squar
 half, x = grid.extent[2] / 2, grid.coordinates(2, dtype=torch.float64)
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained", width_ratios=(1, 1, 1.5))
 for axis, shown, words in zip(axes, wave, ("across the walls", "along the walls"), strict=False):
-    picture = axis.imshow(shown, cmap="gray", vmin=0.3, vmax=0.7, extent=(-half, half, half, -half))
+    axis.imshow(shown, cmap="gray", vmin=0.3, vmax=0.7, extent=(-half, half, half, -half))
     axis.set(title=f"shear {words}", xlabel="x, µm", ylabel="y, µm")
-figure.colorbar(picture, ax=axes[:2], label="of the empty bright field")
+figure.colorbar(axes[0].images[0], ax=axes[:2], label="of the empty bright field")
 for profile, words, style in ((law, "law, no lens", "k:"), (thin, "thin, lens", "C1"), (wave[0], "wave, lens", "C0--")):
     axes[2].plot(x, profile[grid.shape[1] // 2], style, label=words)
 axes[2].set(title="profile across the walls", xlabel="x, µm", ylabel="of the empty bright field")

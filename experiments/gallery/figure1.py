@@ -29,9 +29,9 @@ rows = {"wave": (wave, gray), "exact field": (exact, gray), "wave − exact": (w
 figure, axes = plt.subplots(3, 3, figsize=(8.6, 7.4), layout="constrained", sharex=True, sharey=True)
 for row, (name, (stack, colours)) in zip(axes, rows.items(), strict=True):
     for axis, plane in zip(row, stack, strict=True):
-        shown = axis.imshow(plane, **{"vmin": -0.01, "vmax": 0.01} | colours, extent=(-half, half, half, -half))
+        axis.imshow(plane, **{"vmin": -0.01, "vmax": 0.01} | colours, extent=(-half, half, half, -half))
     row[0].set_ylabel(f"{name}\ny, µm")
-    figure.colorbar(shown, ax=row, label="of the empty bright field")
+    figure.colorbar(row[0].images[0], ax=row, label="of the empty bright field")
 for top, bottom, z, error in zip(axes[0], axes[2], focus, errors, strict=True):
     top.set_title(f"focus {z:g} µm")
     bottom.set(xlabel="x, µm", title=f"rms {error:.3f} of the std")

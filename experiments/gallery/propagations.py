@@ -31,6 +31,7 @@ figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
 for name, found in errors.items():
     axis.loglog(contrasts, found, "o-", label=name)
 axis.set_xticks(contrasts, [str(contrast) for contrast in contrasts])
+axis.set_yticks(ticks := [0.02, 0.05, 0.1, 0.2, 0.4], [str(tick) for tick in ticks])
 axis.minorticks_off()
 axis.set(xlabel="Δn of the bead, 3 µm across, in 1.335", ylabel="error of the image in focus")
 axis.legend()

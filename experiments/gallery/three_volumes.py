@@ -31,10 +31,10 @@ figure, axes = plt.subplots(2, 4, figsize=(10.5, 5), layout="constrained", share
 for column, (name, delta) in zip(axes.T, volumes.items(), strict=True):
     error = float((delta - volumes["truth"]).norm() / volumes["truth"].norm())
     column[0].imshow(delta[8], vmin=0, vmax=0.04, extent=(-width, width, height, -height))
-    shown = column[1].imshow(delta[:, 20], vmin=0, vmax=0.04, extent=(-width, width, -depth, depth), origin="lower")
+    column[1].imshow(delta[:, 20], vmin=0, vmax=0.04, extent=(-width, width, -depth, depth), origin="lower")
     column[0].set_title(name if name == "truth" else f"{name}: error {error:.2f}")
     column[1].set_xlabel("x, µm")
 axes[0, 0].set_ylabel("y, µm")
 axes[1, 0].set_ylabel("z, µm")
-figure.colorbar(shown, ax=axes, label="Δn")
+figure.colorbar(axes[0, 0].images[0], ax=axes, label="Δn")
 plt.show()

@@ -22,12 +22,13 @@ acquisition = Acquisition([Prism((0.0, 0.24), math.pi / 2)], focus=[-1.9, 1.9])
 stacks = {name: image(volume, microscope, acquisition, Fidelity(name))[0] for name in ("projection", "wave")}
 
 half = grid.extent[1] / 2
-figure, axes = plt.subplots(2, 2, figsize=(6.5, 6.4), layout="constrained", sharex=True, sharey=True)
+figure, axes = plt.subplots(2, 2, figsize=(7.5, 6.4), layout="constrained", sharex=True, sharey=True)
 for row, (name, stack) in zip(axes, stacks.items(), strict=True):
     for axis, plane, which in zip(row, stack, ("lower", "upper"), strict=True):
-        axis.imshow(plane, cmap="gray", vmin=0, vmax=1, extent=(-half, half, half, -half))
+        axis.imshow(plane, cmap="gray", vmin=0.2, vmax=0.8, extent=(-half, half, half, -half))
         axis.set(title=f"{name}: {which} bead in focus")
     row[0].set_ylabel("y, µm")
 for axis in axes[1]:
     axis.set_xlabel("x, µm")
+figure.colorbar(axes[0, 0].images[0], ax=axes, label="of the empty bright field")
 plt.show()
