@@ -22,7 +22,7 @@ import torchdic  # noqa: E402
 project, author, release = "torchdic", "The torchdic developers", torchdic.__version__
 project_copyright = f"{author}, BSD-3-Clause"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
-exclude_patterns = ["_build", "generator", "gallery/**/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
+exclude_patterns = ["_build", "generator", "gallery/*.ipynb", "gallery/*.py", "sg_execution_times.rst"]
 myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"

@@ -2,8 +2,8 @@
 ============================
 
 What a fit finds of a cell from two shear axes and nine planes of focus. The images come from finer voxels and more
-directions than the fit's, and have the noise of 5000 photons per pixel. Nucleus, nucleoli and droplets come out where
-they are; along z, of which images say least, a faint haze is left above and below.
+directions than the fit's, and have the noise of 5000 photons per pixel. Nucleus and nucleoli come out where they are,
+a little paler; along z, of which images say least, a faint haze is left above and below.
 """
 
 import math
