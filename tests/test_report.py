@@ -206,9 +206,11 @@ def test_numbers_are_said_with_the_digits_that_they_are_known_to():
     assert short(-0.0) == "0"
     assert short(-0.01234) == "−0.0123"
     assert short(1.2e-7) == "1.20 × 10⁻⁷"
+    assert [short(n) for n in (999.7, -999.7, 99.96, 1234.4)] == ["1000", "−1000", "100", "1234"]
     assert short(float("nan")) == short(None) == "–"
     assert [duration(s) for s in (0.42, 42, 200, 7500)] == ["0.42 s", "42 s", "3 min 20 s", "2 h 5 min"]
-    assert [size(n) for n in (900, 3.1e8)] == ["900 bytes", "310 MB"]
+    assert [duration(s) for s in (3e-5, 9.97, 59.7, 3599.8)] == ["3.0 × 10⁻⁵ s", "10 s", "1 min 0 s", "1 h 0 min"]
+    assert [size(n) for n in (900, 3.1e8, 9.999e8)] == ["900 bytes", "310 MB", "1000 MB"]
 
 
 def test_the_verdict_stands_first_and_the_numbers_have_units(results):
@@ -256,6 +258,43 @@ def test_a_damaged_file_is_named_and_costs_no_more(results, name, damage):
     assert "How it was made" in text
 
 
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("metrics.json", "[" * 100_000),
+        ("log.csv", "step\n1\n2\n"),
+        ("log.csv", f"step,misfit\n{'1' * 200_000},2\n"),
+        ("comparison.json", "{}"),
+    ],
+    ids=["too deep", "one column", "an endless number", "no list"],
+)
+def test_a_file_of_the_right_kind_but_no_use_is_named_too(results, name, damage):
+    (results / name).write_text(damage)
+    assert f"{name}: " in text_of(results)
+
+
+def test_images_that_are_no_pairs_are_named(results):
+    write_stack(results / "images.ome.tif", images()[0][:1], GRID.spacing[1:], 1.0)
+    assert "images.ome.tif: holds 1 channels, no measured and modelled ones in turn" in text_of(results)
+
+
+def test_the_page_of_a_folder_has_its_name_wherever_one_stands(results, monkeypatch):
+    (results / "below").mkdir()
+    monkeypatch.chdir(results / "below")
+    assert Folder(Path("..")).name == results.name
+
+
+def test_a_name_that_is_no_utf_8_loses_no_page(tmp_path):
+    """As other encodings leave names on Linux."""
+    out = tmp_path / os.fsdecode(b"caf\xe9")
+    try:
+        out.mkdir()
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 alone")
+    leave_results(out)
+    assert "caf?" in leave_report(out).read_text(encoding="utf-8")
+
+
 # Values of other kinds than are expected, as JSON may hold them.
 ODD = (None, "word", [3.0, [None]], [{"a": 3.0}], {"a": [3.0], "specimen": {"a": "word"}})
 
@@ -266,6 +305,11 @@ def test_numbers_of_another_version_lose_no_page(results, name):
     for value in ODD:
         (results / name).write_text(json.dumps(dict.fromkeys(keys, value)), encoding="utf-8")
         assert "Three sections through one point" in text_of(results)
+
+
+def test_what_should_be_words_and_is_not_is_left_out(results):
+    (results / "metrics.json").write_text(json.dumps(METRICS | {"seen": {"lacks": 5}}), encoding="utf-8")
+    assert "The volume explains the stack" in text_of(results)
 
 
 def test_error_bars_of_an_earlier_volume_are_said_to_be(results):

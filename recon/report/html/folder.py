@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -30,8 +31,8 @@ class Folder:
 
     @property
     def name(self) -> str:
-        """Its name."""
-        return self.path.absolute().name
+        """Its name, also where the path is ".."; a link's own."""
+        return os.path.basename(os.path.abspath(self.path))
 
     def has(self, name: str) -> bool:
         """Whether there is such a file."""
@@ -49,6 +50,8 @@ class Folder:
     def records(self, name: str) -> list[dict[str, Any]]:
         """A file of JSON that holds a list of tables; an empty one where it can't be read."""
         found = self._read(name, _parsed)
+        if found is not None and not isinstance(found, list):
+            self.damaged.append(f"{name}: holds no list")
         return [one for one in found if isinstance(one, dict)] if isinstance(found, list) else []
 
     def text(self, name: str) -> str | None:
@@ -81,11 +84,8 @@ class Folder:
             return None
         try:
             return read(self.path / name)
-        except (
-            OSError,
-            ValueError,
-            MemoryError,
-        ) as error:  # what isn't text, JSON, TOML or a stack raises a ValueError
+        # what isn't text, JSON, TOML or a stack raises a ValueError; one that is nested too deeply a RecursionError
+        except (OSError, ValueError, MemoryError, RecursionError, csv.Error) as error:
             line = (str(error).splitlines() or [type(error).__name__])[0]
             self.damaged.append(f"{name}: {line.removeprefix(f'{self.path / name}: ')}")
             return None
@@ -116,6 +116,6 @@ def _parsed(path: Path) -> Any:
 def _numbers(path: Path) -> list[list[float]]:
     with path.open(newline="", encoding="utf-8") as file:
         rows = [[float(value) for value in row] for row in list(csv.reader(file))[1:] if row]
-    if any(len(row) != len(rows[0]) for row in rows):
-        raise ValueError("its rows aren't all as long")
+    if any(len(row) != len(rows[0]) or len(row) < 2 for row in rows):
+        raise ValueError("its rows aren't all as long, of two numbers or more")
     return rows

@@ -148,8 +148,9 @@ def _causes(verdict: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield _sentence(name), reason, advice
 
 
-def _sentences(parts: Iterable[str | None]) -> tuple[str, ...]:
-    return tuple(f"{_sentence(part)}." for part in parts if part)
+def _sentences(parts: Iterable[object]) -> tuple[str, ...]:
+    """Those of the parts that are words, as sentences."""
+    return tuple(f"{_sentence(part)}." for part in parts if isinstance(part, str) and part)
 
 
 def _sentence(words: str) -> str:

@@ -70,8 +70,10 @@ def images_of(folder: Folder, acquisition: dict[str, Any]) -> Images | None:
 
 def _read(folder: Folder) -> tuple[Stack, dict[str, np.ndarray]] | None:
     """The stack that a folder holds, and its images by what they are: measured and modelled, or simulated."""
-    if (stack := folder.stack(PAIRS)) is not None and len(stack.data) % 2 == 0:
-        return stack, {"measured": stack.data[0::2], "modelled": stack.data[1::2]}
+    if (stack := folder.stack(PAIRS)) is not None:
+        if len(stack.data) % 2 == 0:
+            return stack, {"measured": stack.data[0::2], "modelled": stack.data[1::2]}
+        folder.damaged.append(f"{PAIRS}: holds {len(stack.data)} channels, no measured and modelled ones in turn")
     if (stack := folder.stack(STACK)) is not None:
         return stack, {"simulated": stack.data}
     return None

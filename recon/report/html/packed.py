@@ -70,7 +70,7 @@ def _left(shape: Sequence[int], blocks: Sequence[int]) -> list[int]:
 def in_levels(array: Float[np.ndarray, "..."], low: float, high: float) -> Shaped[np.ndarray, "..."]:
     """Values as whole numbers from 0 for the low one to LEVELS for the high one; what is beyond is cut off."""
     span = high - low
-    scaled = (array - low) * (LEVELS / span) if span > 0 else np.zeros_like(array)
+    scaled = (array - low) / span * LEVELS if span > 0 else np.zeros_like(array)
     return np.clip(scaled.round(), 0, LEVELS).astype(np.uint8)
 
 

@@ -132,7 +132,7 @@ def page(folder: Folder, kind: tuple[str, str]) -> str:
         "missing": tuple(_missing(folder, kind[0])),
         "data": data,
     }
-    return _template().render(
+    written = _template().render(
         **shown,
         name=folder.name,
         version=__version__,
@@ -143,6 +143,8 @@ def page(folder: Folder, kind: tuple[str, str]) -> str:
         plotly=_plotly() if data["surfaces"] is not None else None,
         short=short,
     )
+    # bytes of a file's name that are no UTF-8 can't stand in a page that is
+    return written.encode("utf-8", "replace").decode("utf-8")
 
 
 def _spectrum(images: Images, metrics: dict[str, Any], config: dict[str, Any]) -> Markup | None:

@@ -18,7 +18,9 @@ def short(value: object, digits: int = 3) -> str:
     if value and (abs(value) < 1e-4 or abs(value) >= 1e6):
         mantissa, power = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa} × 10{_raised(int(power))}".replace("-", "−")
-    written = f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+    written = f"{value:.{digits}g}"
+    if abs(float(written)) >= 10**digits:  # "g" would write 1e+03
+        written = f"{value:.0f}"
     return written.replace("-", "−")
 
 
@@ -44,8 +46,8 @@ def duration(seconds: object) -> str:
     """A time as one says it: 0.8 s, 42 s, 3 min 20 s, 2 h 5 min."""
     if not is_number(seconds):
         return NONE
-    if seconds < 60:
-        return f"{seconds:.2g} s" if seconds < 10 else f"{seconds:.0f} s"
+    if seconds < 59.5:
+        return f"{short(seconds, 2)} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
     if minutes < 60:
         return f"{minutes} min {rest} s"
@@ -58,7 +60,7 @@ def size(number: object) -> str:
         return NONE
     for unit, power in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if number >= power:
-            return f"{number / power:.3g} {unit}"
+            return f"{short(number / power)} {unit}"
     return f"{number:.0f} bytes"
 
 
