@@ -102,6 +102,22 @@ def test_a_missing_file_is_named(write, tmp_path):
     assert message == f"include: {tmp_path / 'microscop.toml'}: No such file or directory"
 
 
+def test_a_link_to_itself_is_named(write, tmp_path):
+    (tmp_path / "loop.toml").symlink_to("loop.toml")
+    error = the_error(write("run.toml", 'include = "loop.toml"'))
+    assert error == f"include: {tmp_path / 'loop.toml'}: Too many levels of symbolic links"
+
+
+def test_a_folder_that_results_cannot_name_is_refused(write, tmp_path):
+    """Its name isn't UTF-8, and config.resolved.toml says where the stack is."""
+    try:
+        (tmp_path / "caf\udce9").mkdir()
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 alone")
+    error = the_error(write("caf\udce9/run.toml", f'{SPECIMEN}\n[data]\npath = "s.tif"'))
+    assert error.endswith("s.tif is a name that isn't UTF-8, in which a configuration is written; rename it")
+
+
 def test_a_file_that_is_not_toml_is_named(write, tmp_path):
     write("microscope.toml", "[microscope\n")
     message = the_error(write("a.toml", f'include = "microscope.toml"\n{SPECIMEN}'))

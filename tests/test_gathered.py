@@ -83,6 +83,13 @@ def test_a_file_that_is_named_twice_is_refused(tmp_path, monkeypatch):
         gather([Path("a.tif"), tmp_path / "a.tif"])
 
 
+def test_a_link_to_itself_is_no_file(tmp_path):
+    link = tmp_path / "a.tif"
+    link.symlink_to("a.tif")
+    with pytest.raises(StackError, match=r"a\.tif: cannot be opened: Too many levels of symbolic links"):
+        gather([link])
+
+
 def test_one_file_is_read_as_it_is(tmp_path):
     write_stack(tmp_path / "one.ome.tif", STACK, (0.1, 0.1), 0.5, bits=12)
     gathered = gather([tmp_path / "one.ome.tif"])

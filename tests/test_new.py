@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import re
 import tomllib
 from dataclasses import replace
@@ -265,7 +266,6 @@ REFUSALS = {
     ("--pixel-size", "110"): "--pixel-size: 110 µm is no size of a pixel",
     ("--shear", "180"): "--shear: 180 µm is no shear",
     ("--na", "0"): "--na 0 must be above 0",
-    ("--na", "2.5"): "objective NA 2.5 must be at most 1.8",
     ("--background", "0.9"): "--background 0.9 must be at least 1",
     ("--background", "13.6"): "--background: 13.6 is no refractive index of a transparent medium (at most 6); is the",
     ("--offset", "-1"): "--offset -1 must be at least 0:",
@@ -306,9 +306,61 @@ def test_a_decimal_comma_is_refused_with_the_number_in_its_place(tmp_path, capsy
     assert f"argument {option}: 'much' is no number" in capsys.readouterr().err
 
 
-def test_options_are_checked_before_the_stack_is_read(tmp_path, capsys):
-    assert new(tmp_path / "missing.tif", "--out", tmp_path / "run.toml", "--na", -1) == 2
-    assert "--na -1 must be above 0" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--na", -1), "--na -1 must be above 0"),
+        (("--na", 9), "--na: objective NA 9 must be at most 1.8: no immersion has a higher index"),
+        (("--condenser-na", 2), "--condenser-na: condenser NA 2 must be at most 1.8: no immersion has a higher index"),
+        (("--na", 2.5, "--background", 2.4), "--na: objective NA 2.5 must be at most 2.4: no immersion has a higher"),
+    ],
+)
+def test_options_are_checked_before_the_stack_is_read(tmp_path, capsys, words, told):
+    assert new(tmp_path / "missing.tif", "--out", tmp_path / "run.toml", *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"torchdic: error: {told}")
+
+
+def test_a_configuration_that_would_break_a_law_is_not_blamed_as_if_it_were_there(tmp_path, recording, capsys):
+    """The shear's usual length follows from NA and wavelength."""
+    out = tmp_path / "run.toml"
+    assert new(written(recording, tmp_path), "--out", out, "--na", 0.001) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    told = f"{out} isn't written, because it would say: acquisition.prisms[0].shear.length: 273 µm is no shear"
+    assert line.startswith(f"torchdic: error: {told}")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["two\nlines.tif", "it's # [a] = \"b\"\\ & <c> ü 细.tif", "bell\x07.tif"])
+def test_a_file_may_have_any_name(tmp_path, recording, name):
+    stack = written(recording, tmp_path).rename(tmp_path / name)
+    assert new(stack, "--out", tmp_path / "runs" / "run.toml") == 0
+    assert load(tmp_path / "runs" / "run.toml").data.path == str(stack)
+
+
+def in_latin_1(tmp_path, name):
+    """A name that is no UTF-8, as other encodings leave it on Linux."""
+    path = tmp_path / os.fsdecode(name.encode("latin-1"))
+    try:
+        path.touch()
+    except OSError:
+        pytest.skip("this file system has names in UTF-8 alone")
+    path.unlink()
+    return path
+
+
+def test_a_name_that_no_configuration_can_hold_is_refused(tmp_path, recording, capsys):
+    stack = written(recording, tmp_path).rename(in_latin_1(tmp_path, "café.tif"))
+    assert new(stack, "--out", tmp_path / "run.toml") == 2
+    assert "is a name that isn't UTF-8, in which a configuration is written; rename it" in capsys.readouterr().err
+    assert not (tmp_path / "run.toml").exists()
+
+
+def test_files_that_are_joined_may_have_names_in_another_encoding(tmp_path, recording):
+    for number, images in enumerate(recording.data):
+        write_stack(in_latin_1(tmp_path, f"é{number}.tif"), images)
+    assert new(*sorted(tmp_path.glob("*.tif")), "--out", tmp_path / "run.toml") == 0
+    assert len(load(tmp_path / "run.toml").acquisition.prisms) == 2
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,14 @@ def test_a_stack_keeps_its_prisms_names_and_may_lack_sizes(tmp_path):
     assert stack.focus_step is None
 
 
+@pytest.mark.parametrize("names", [("bell\x07", "caf\udce9"), ("caf\udce9",)])
+def test_a_name_that_no_xml_can_hold_is_written_with_question_marks(tmp_path, names):
+    """Names of files become those of prisms: bytes that are no UTF-8 stand in them as halves of signs."""
+    path = tmp_path / "stack.ome.tif"
+    write_stack(path, np.ones((len(names), 3, 5, 4), np.float32), names=names)
+    assert read_stack(path).names == ("bell?", "caf?")[-len(names) :]
+
+
 @pytest.mark.parametrize("shape", [(4, 6, 5), (1, 6, 5), (3, 5, 1)])
 @pytest.mark.parametrize("compression", CODECS)
 def test_a_volume_reads_back_as_float32_on_its_grid(tmp_path, shape, compression):

@@ -50,12 +50,16 @@ def chosen(given: float | None, said: float | None, guess: float, name: str, why
     return Sourced(guess, "assumed", why, name)
 
 
+# What no comment of TOML can hold: control characters, and what stands for bytes of a name that isn't UTF-8.
+_UNWRITABLE = re.compile(r"[\x00-\x08\x0a-\x1f\x7f\ud800-\udfff]")
+
+
 def commented(head: Sequence[str], top: Sequence[Line], tables: Mapping[str, Sequence[Line]]) -> str:
-    """A TOML text.
+    """A TOML text; what no comment can hold is a question mark in it.
 
     head: lines of comment at its beginning. top: keys before the first table. tables: the lines of each table.
     """
-    lines = [f"# {line}".rstrip() for line in head]
+    lines = [f"# {_UNWRITABLE.sub('?', line)}".rstrip() for line in head]
     if top:
         lines += ["", *_lines(top)]
     for name, below in tables.items():
@@ -134,4 +138,4 @@ def _lines(below: Sequence[Line]) -> list[str]:
 
 
 def _with(text: str, comment: str) -> str:
-    return f"{text:<40} # {comment}" if comment else text
+    return f"{text:<40} # {_UNWRITABLE.sub('?', comment)}" if comment else text

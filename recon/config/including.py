@@ -5,6 +5,7 @@ A microscope is described once and used for many specimens: `include = "microsco
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def values_of(path: Path) -> tuple[Table, list[Path]]:
     folder of the file that says it.
 
     Raises ValueError, in one line that doesn't name `path`, for a file that can't be read, isn't TOML or includes
-    itself, and for an `include` that is no name.
+    itself, for an `include` that is no name, and for files whose names aren't UTF-8.
     """
     found: list[Path] = []
     return _values(path, (), found), found
@@ -46,9 +47,9 @@ def _values(path: Path, above: tuple[Path, ...], found: list[Path]) -> Table:
     except OSError as error:
         raise ValueError(error.strerror or str(error)) from error
     values = _from_folder(values, path.parent)
-    chain, beneath = (*above, path.resolve()), {}
+    chain, beneath = (*above, _resolved(path)), {}
     for name in _names(values.pop(INCLUDE, [])):
-        included = (path.parent / name).resolve()
+        included = _resolved(path.parent / name)
         if included in chain:
             circle = " → ".join(file.name for file in (*chain[chain.index(included) :], included))
             raise CircleError(f"{INCLUDE}: {circle} is a circle: a file can't include itself")
@@ -60,6 +61,11 @@ def _values(path: Path, above: tuple[Path, ...], found: list[Path]) -> Table:
             raise ValueError(f"{INCLUDE}: {included}: {error}") from error
         found.append(included)
     return _over(values, beneath)
+
+
+def _resolved(path: Path) -> Path:
+    """As `Path.resolve`, which raises where links lead in a circle; reading says so in plain words."""
+    return Path(os.path.realpath(path))
 
 
 def _names(value: Any) -> list[str]:
@@ -91,11 +97,23 @@ def _over(upper: Table, lower: Table, key: str = "") -> Table:
 
 
 def seen_from(folder: Path, file: Path) -> str:
-    """A file's name as a configuration in a folder says it: from there, unless it is on another drive."""
+    """A file's name as a configuration in a folder says it: from there, unless it is on another drive.
+
+    Raises ValueError for a name that isn't UTF-8.
+    """
+    seen = os.path.realpath(file)
+    with suppress(ValueError):
+        seen = os.path.relpath(seen, os.path.realpath(folder))
+    return _writable(Path(seen).as_posix())
+
+
+def _writable(name: str) -> str:
+    """A file's name, where TOML can hold it. Raises ValueError elsewhere."""
     try:
-        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
-    except ValueError:
-        return str(file.resolve())
+        name.encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"{name} is a name that isn't UTF-8, in which a configuration is written; rename it") from error
+    return name
 
 
 def relative_to(values: Table, folder: Path) -> Table:
@@ -105,7 +123,7 @@ def relative_to(values: Table, folder: Path) -> Table:
 
 def _from_folder(values: Table, folder: Path) -> Table:
     """The values with relative names of files starting from a folder."""
-    return _with_files(values, lambda name: str((folder / name).resolve()))
+    return _with_files(values, lambda name: _writable(os.path.realpath(folder / name)))
 
 
 def _with_files(values: Table, change: Callable[[str], str]) -> Table:

@@ -1,5 +1,6 @@
 """A stack that lies in several files: a folder of planes, a file for each plane, or a file for each prism setting."""
 
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -110,11 +111,12 @@ def _listed(paths: Sequence[Path]) -> tuple[tuple[Path, ...], Path | None]:
         raise StackError("no stack is named: give a file, several, or a folder of planes")
     folders = [path for path in paths if path.is_dir() and not format_of(path).folder]
     if not folders:
-        known: dict[Path, Path] = {}
+        known: set[str] = set()
         for path in paths:
-            if path.resolve() in known:
+            whole = os.path.realpath(path)
+            if whole in known:
                 raise StackError(f"{path}: is named twice; each file is a prism setting, or a plane, of its own")
-            known[path.resolve()] = path
+            known.add(whole)
         return tuple(paths), None
     if len(paths) > 1:
         raise StackError(f"{folders[0]}: is a folder; give one folder, or files")

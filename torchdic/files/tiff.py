@@ -1,6 +1,7 @@
 """The format TIFF: read with its axes and sizes (OME, ImageJ or plain), and written as OME-TIFF."""
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ from torchdic.files.full_scale import full_scale
 from torchdic.files.tiff_structure import check_pages, check_pixels
 
 _OME_DTYPES = ("int8", "int16", "int32", "uint8", "uint16", "uint32", "float32", "float64")
+
+# Control characters, and what stands for bytes of a name that isn't UTF-8.
+_NOT_XML = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 _MOST_PER_CENTIMETRE = 2**32 - 1  # a resolution is a fraction of two 32-bit integers
 
@@ -150,14 +154,14 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
     dy, dx = stack.pixel_size or (None, None)
     # Fiji's Bio-Formats shows the image's name above each plane, and no channel's
     named = stack.names[0] if len(stack.names) == 1 else Path(stack.source).name.partition(".")[0]
-    metadata: dict[str, object] = {"axes": "CZYX", "Name": named}
+    metadata: dict[str, object] = {"axes": "CZYX", "Name": _as_xml(named)}
     for axis, length in zip("ZYX", (stack.focus_step, dy, dx), strict=True):
         if length is not None:
             metadata |= {f"PhysicalSize{axis}": float(length), f"PhysicalSize{axis}Unit": "µm"}
     if stack.bits is not None:
         metadata["SignificantBits"] = stack.bits
     if stack.names:
-        metadata["Channel"] = {"Name": list(stack.names)}
+        metadata["Channel"] = {"Name": [_as_xml(name) for name in stack.names]}
     resolution = {}
     if dy is not None and dx is not None and 1e4 / min(dy, dx) <= _MOST_PER_CENTIMETRE:
         # for readers without OME, plain ImageJ among them
@@ -172,6 +176,11 @@ def _write(path: Path, stack: Stack, compression: str | None) -> None:
             compression=compression,
             **resolution,
         )
+
+
+def _as_xml(name: str) -> str:
+    """A name, such as a file's, with a question mark for each sign that no XML can hold."""
+    return _NOT_XML.sub("?", name)
 
 
 @contextmanager

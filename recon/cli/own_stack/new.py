@@ -13,7 +13,7 @@ from recon.cli.own_stack.unusable import check_background, check_recorded, put_b
 from recon.config.including import seen_from
 from recon.config.plausible.unlikely import unlikely
 from recon.config.reading import parse
-from recon.config.schema import ConfigError
+from recon.config.schema import Config, ConfigError
 from recon.recording.stuck_pixels import sharpest
 from recon.recording.survey.survey import Survey, survey
 from torchdic import Microscope, Objective
@@ -57,9 +57,9 @@ def run(options: argparse.Namespace) -> None:
     if joined is not None:
         check_not_there([joined])
     data = options.stack[0] if gathered.one_file and not options.stack[0].is_dir() else gathered.files[0]
-    path = seen_from(out.parent, data if joined is None else joined)
+    path = _seen_from(out.parent, data if joined is None else joined)
     text = template(gathered, found, settled, path, options.series if joined is None else None)
-    config = parse(text.encode(), str(out))  # what the user gave may break a law
+    config = _parsed(text, out)
     out.parent.mkdir(parents=True, exist_ok=True)
     if joined is not None:
         _join(gathered, settled, joined)
@@ -72,6 +72,21 @@ def run(options: argparse.Namespace) -> None:
         f"\nCorrect what is assumed in {out}. Then torchdic calibrate {out} finds what the images can tell, and "
         f"torchdic reconstruct {out} the volume."
     )
+
+
+def _seen_from(folder: Path, stack: Path) -> str:
+    try:
+        return seen_from(folder, stack)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _parsed(text: str, out: Path) -> Config:
+    """The configuration, before it is written: what the user gave, or what follows from it, may break a law."""
+    try:
+        return parse(text.encode(), "")
+    except ConfigError as error:
+        raise ConfigError(f"{out} isn't written, because it would say{error}") from error
 
 
 def look(gathered: Gathered, given: Given) -> tuple[Survey, Settled]:

@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from recon.cli import arguments
+from recon.cli.own_stack.settled import BACKGROUND, WAVELENGTH
 from recon.config.plausible.impossible import impossible
 from recon.config.plausible.unlikely import like_radians
 from recon.config.schema import ConfigError
+from torchdic import Condenser, Microscope, Objective
+from torchdic.instrument.microscope import check_apertures
 
 # What was given, under the options' names; None where nothing was.
 Given = dict[str, Any]
@@ -47,6 +50,12 @@ _AS_KEYS: dict[str, Callable[[float], dict[str, Any]]] = {
     "bias": lambda value: {"acquisition": {"prisms": [{"bias_degrees": value}]}},
 }
 
+# Where an aperture is held, which is checked with the medium's index.
+_APERTURES: dict[str, Callable[[float], Microscope]] = {
+    "na": lambda value: Microscope(WAVELENGTH, Objective(value)),
+    "condenser_na": lambda value: Microscope(WAVELENGTH, condenser=Condenser(value)),
+}
+
 # The least values of options that need not be above 0.
 _LEAST = {"background": 1.0} | dict.fromkeys(("offset", *_ANGLES), -math.inf)
 
@@ -64,7 +73,17 @@ def given_of(options: argparse.Namespace) -> Given:
     for name, told in given.items():
         for value in _each(told):
             _check(name, value)
+    for name, microscope in _APERTURES.items():
+        if given[name] is not None:
+            _check_aperture(name, microscope(given[name]), given["background"] or BACKGROUND)
     return given
+
+
+def _check_aperture(name: str, microscope: Microscope, background: float) -> None:
+    try:
+        check_apertures(microscope, background)
+    except ValueError as error:
+        raise ConfigError(f"--{name.replace('_', '-')}: {error}") from error
 
 
 def _check(name: str, value: float) -> None:
