@@ -331,7 +331,7 @@ def test_a_configuration_that_would_break_a_law_is_not_blamed_as_if_it_were_ther
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["two\nlines.tif", "it's # [a] = \"b\"\\ & <c> ü 细.tif", "bell\x07.tif"])
+@pytest.mark.parametrize("name", ["two\nlines.tif", 'it\'s # [a] = "b"\\ & <c> ü 细.tif', "bell\x07.tif"])
 def test_a_file_may_have_any_name(tmp_path, recording, name):
     stack = written(recording, tmp_path).rename(tmp_path / name)
     assert new(stack, "--out", tmp_path / "runs" / "run.toml") == 0

@@ -1,10 +1,13 @@
 """A field cut into tiles: they cover it, count as the whole does, and their fits together are the fit of the whole."""
 
+import errno
 import json
 import math
 from collections import deque
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -37,6 +40,7 @@ from torchdic import (
     ShortOfMemoryError,
     Volume,
 )
+from torchdic.files.stack import write_stack
 
 NOISE = 0.004
 
@@ -454,6 +458,41 @@ def test_tiles_that_make_no_sense_are_refused(workplace, tmp_path, change, told)
     assert code == 2
     assert told in err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_field_of_which_no_tile_can_be_fitted_is_refused(workplace, tmp_path):
+    """Either prism has pixels that count in one tile alone."""
+    counts = np.zeros((2, 1, 22, 40), np.uint8)
+    counts[0, ..., :12] = counts[1, ..., -12:] = 1
+    write_stack(workplace / "mask.tif", counts)
+    path = workplace / "masked.toml"
+    path.write_text(CONFIG.replace("[data]", "[data]\nmask = 'mask.tif'"), encoding="utf-8")
+    code, err = command("reconstruct", path, "--out", tmp_path / "out")
+    assert code == 2
+    (line,) = (line for line in err.splitlines() if "error" in line)
+    assert line.endswith(
+        "reconstruction.tiles: none of 2 tiles can be fitted: in tile 1-1 no pixel of prism 2 counts; "
+        "take larger tiles, or leave out less of the images"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_is_full_after_the_first_steps_is_told_of_by_the_tile(workplace, tmp_path, monkeypatch):
+    """What the tiles are is there by then."""
+    replace_, full = Path.replace, []
+
+    def fails(path, target):
+        if full:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        full.extend([True] if Path(target).name == "layout.json" else [])
+        return replace_(path, target)
+
+    monkeypatch.setattr(Path, "replace", fails)
+    code, err = command("reconstruct", workplace / "a.toml", "--out", tmp_path / "out")
+    assert code == 2
+    assert "fitted.pt: cannot be written: No space left on device; make room and go on with --resume" in err
+    monkeypatch.setattr(Path, "replace", replace_)
+    assert command("reconstruct", workplace / "a.toml", "--out", tmp_path / "out", "--resume")[0] == 0
 
 
 def test_error_bars_say_that_a_fit_by_tiles_has_none(workplace):

@@ -112,7 +112,8 @@ def _writable(name: str) -> str:
     try:
         name.encode()
     except UnicodeEncodeError as error:
-        raise ValueError(f"{name} is a name that isn't UTF-8, in which a configuration is written; rename it") from error
+        told = f"{name} is a name that isn't UTF-8, in which a configuration is written; rename it"
+        raise ValueError(told) from error
     return name
 
 

@@ -37,7 +37,7 @@ from recon.run.room import (
     check_room_for_report,
     check_room_for_volume,
 )
-from recon.run.tiles.fitting import TiledFit
+from recon.run.tiles.fitting import TiledFit, tiles_to_fit
 from recon.run.tiles.kept import TILES, forget, remembered_side
 from recon.run.tiles.sizes import Cut, cut_of
 from torchdic import Fidelity
@@ -81,12 +81,13 @@ def reconstruct(
         cut = cut_of(config, problem, made, budget, None if restart else remembered_side(out))
     else:  # a field of which a fit is under way stays whole
         check_room_for_descent(problem, made)
+    tiled = None if cut is None else _tiled(config, measured, problem, cut, out, identity)
     _check_room_for_report(problem)
     prepare_folder(out)
     if restart:
         forget(out)
-    if cut is not None:
-        result = _in_tiles(config, measured, problem, cut, out, identity)
+    if tiled is not None:
+        result = _in_tiles(config, measured, tiled)
         warn_of_changes(config, before)
         return result
     forecast = Forecast(problem)
@@ -122,15 +123,21 @@ def _solved(config: Config, measured: Measured, problem: Problem, out: Path, ide
     return write_results(out, config, measured, problem, Checkpoint(step, [], identity), sections)
 
 
-def _in_tiles(config: Config, measured: Measured, whole: Problem, cut: Cut, out: Path, identity: str) -> Result:
-    """The results of a fit by tiles, which are removed once the command has left all that it leaves."""
+def _tiled(config: Config, measured: Measured, whole: Problem, cut: Cut, out: Path, identity: str) -> TiledFit:
+    """The fit by tiles of a field; lines say of which. Raises ConfigError where no tile can be fitted."""
     problem, layout = cut.problem(whole), cut.layout
     sides = f"{layout.along_y.count} × {layout.along_x.count} voxels"
     print(f"{len(layout)} tiles of {sides} and {layout.margin} more on each side (tiles = {layout.side})")
-    tiled = TiledFit(problem, layout, measured.noise, out, identity, config.reconstruction.checkpoint_every).fitted()
-    config = replace(config, reconstruction=replace(config.reconstruction, tiles=layout.side))
+    tiles, every = tiles_to_fit(problem, layout), config.reconstruction.checkpoint_every
+    return TiledFit(problem, layout, tiles, measured.noise, out, identity, every)
+
+
+def _in_tiles(config: Config, measured: Measured, fit: TiledFit) -> Result:
+    """The results of a fit by tiles, which are removed once the command has left all that it leaves."""
+    out, tiled = fit.out, fit.fitted()
+    config = replace(config, reconstruction=replace(config.reconstruction, tiles=fit.layout.side))
     try:
-        result = write_results(out, config, measured, problem, tiled.ended, tiled=tiled)
+        result = write_results(out, config, measured, fit.whole, tiled.ended, tiled=tiled)
     except ResultsError as error:
         raise ResultsError(f"{error}{GO_ON}") from error
     for name in (LOG, CHECKPOINT):  # of an earlier fit of the whole

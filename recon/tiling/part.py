@@ -72,8 +72,10 @@ def without_margin(problem: Problem) -> Problem:
 def lacks(whole: Problem, layout: Layout, tile: Tile) -> str | None:
     """Why there is nothing to fit in a tile; None where there is. whole: without a margin."""
     mask, support = whole.misfit.mask, whole.support
-    if mask is not None and not bool(mask[..., tile.rows.pixels, tile.columns.pixels].flatten(1).any(1).all()):
-        return "no pixel counts"
+    if mask is not None:
+        counts = mask[..., tile.rows.pixels, tile.columns.pixels].flatten(1).any(1).tolist()
+        if not all(counts):
+            return f"no pixel of prism {counts.index(False) + 1} counts" if any(counts) else "no pixel counts"
     if support is not None and not bool(_with_margin(support, tile, layout.margin).any()):
         return "no Δn is sought"
     return None

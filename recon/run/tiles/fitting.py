@@ -11,6 +11,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from recon.config.schema import ConfigError
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference
@@ -29,33 +30,41 @@ from torchdic.ranks.group import rank, ranks
 from torchdic.ranks.shared import everywhere
 
 
+def tiles_to_fit(whole: Problem, layout: Layout) -> tuple[Tile, ...]:
+    """The tiles in which there is something to fit, in the order in which they are; a line names the others.
+
+    whole: the problem of the field, without a margin. Raises ConfigError where there is none.
+    """
+    told = [(tile, lacks(whole, layout, tile)) for tile in strongest_first(layout, whole.misfit)]
+    found = tuple(tile for tile, reason in told if reason is None)
+    if not found:
+        first, reason = told[0]
+        raise ConfigError(
+            f"reconstruction.tiles: none of {len(told)} tiles can be fitted: in tile {first} {reason}; take larger "
+            "tiles, or leave out less of the images"
+        )
+    for tile, reason in told:
+        if reason is not None:
+            print(f"tile {tile}: {reason}: Δn stays 0 there")
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class TiledFit:
     """A field that is fitted tile by tile.
 
-    whole: the problem of the field, without a margin. layout: of its tiles. noise: standard deviation of each prism's;
-    None isn't known. out: folder of the results. identity: what the fit depends on. checkpoint_every: steps between
-    two checkpoints of a tile.
+    whole: the problem of the field, without a margin. layout: of its tiles. tiles: those that are fitted, in the order
+    in which they are, see `tiles_to_fit`. noise: standard deviation of each prism's; None isn't known. out: folder of
+    the results. identity: what the fit depends on. checkpoint_every: steps between two checkpoints of a tile.
     """
 
     whole: Problem
     layout: Layout
+    tiles: tuple[Tile, ...]
     noise: Sequence[float] | None
     out: Path
     identity: str
     checkpoint_every: int
-
-    @cached_property
-    def tiles(self) -> tuple[Tile, ...]:
-        """The tiles in which there is something to fit, in the order in which they are; a line names the others."""
-        found = []
-        for tile in strongest_first(self.layout, self.whole.misfit):
-            reason = lacks(self.whole, self.layout, tile)
-            if reason is None:
-                found.append(tile)
-            else:
-                print(f"tile {tile}: {reason}: Δn stays 0 there")
-        return tuple(found)
 
     def fitted(self) -> Tiled:
         """Fit the tiles that have yet to be fitted, and put all of them together.

@@ -64,9 +64,11 @@ def begun(folder: Path, identity: str) -> Checkpoint | None:
 def remember_side(out: Path, side: int, memory: int) -> None:
     """Leave what the tiles of a run are, for another one to go on, in the folder of its tiles, which exists.
 
-    side: as given. memory: of a tile's images. Raises WriteError.
+    side: as given. memory: of a tile's images. Raises WriteError, and CheckpointError as `remembered_side` does.
     """
-    write_json(out / TILES / LAYOUT, {"side": side, "memory": memory})
+    # once it is there, a disk that is full is told of by the file that has no room, not by this one
+    if remembered_side(out) != (side, memory):
+        write_json(out / TILES / LAYOUT, {"side": side, "memory": memory})
 
 
 def remembered_side(out: Path) -> tuple[int, int] | None:
