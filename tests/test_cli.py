@@ -475,11 +475,15 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
         assert "dark" in line
 
 
-def test_a_simulation_is_replaced_by_another_one(write, run, tmp_path):
-    """It can be made again in seconds, unlike a stack that came from elsewhere (tests/test_folder.py)."""
+def test_a_simulation_is_replaced_by_another_one_only_where_the_user_says_so(write, run, tmp_path):
+    """As any results are; beside a reconstruction's configuration it may be the stack of that."""
     assert run("simulate", write())[0] == 0
     first = (tmp_path / "out" / "stack.ome.tif").read_bytes()
-    assert run("simulate", write({"microscope.objective.na": 0.6}))[0] == 0
+    code, said = run("simulate", write({"microscope.objective.na": 0.6}))
+    assert code == 2
+    assert "stack.ome.tif: the folder has results; name another one, or replace them with --restart" in said[-1]
+    assert (tmp_path / "out" / "stack.ome.tif").read_bytes() == first
+    assert run("simulate", write({"microscope.objective.na": 0.6}), "--restart")[0] == 0
     assert (tmp_path / "out" / "stack.ome.tif").read_bytes() != first
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
-from recon.config.resolved import RESOLVED, leave_resolved
+from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.planned import announce
 from recon.report import figures
@@ -29,12 +29,8 @@ STACK = "stack.ome.tif"
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder.
-
-    An earlier simulation, which can be made again in seconds, is replaced; a stack that came from elsewhere is not.
-    """
-    simulated = (options.out / RESOLVED).exists()
-    check_no_results(options.out, (STACK,), restart=options.restart or simulated)
+    """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder."""
+    check_no_results(options.out, (STACK,), restart=options.restart)
     config = load(options.config)
     specimen = specimen_of(config, str(options.config))
     if config.simulation.exact and config.tolerance is not None:
