@@ -258,13 +258,14 @@ def test_a_calibrated_configuration_is_the_old_one_with_what_was_found(tmp_path,
     monkeypatch.setattr("recon.run.calibration.calibrate.by_specimen", turned)
     monkeypatch.setattr("recon.calibration.trials.orders.ROUNDS", (Round(2, 2, 1, 3),))
     write_stack(tmp_path / "stack.ome.tif", recorded, (0.2, 0.2), 1.2)
-    (tmp_path / "run.toml").write_text(RUN, encoding="utf-8")
+    run = f"{RUN}\n[calibration]\nlength_within = 0.3 # read in the dark\nbias_within_degrees = 5.0\n"
+    (tmp_path / "run.toml").write_text(run, encoding="utf-8")
     assert main(["calibrate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 0
     said = capsys.readouterr()
     assert "shear's angle: 310 ± 0.57°, told 300°" in said.out
     assert "signs and orders, round 1 of 1: 100%" in said.err
     text = (tmp_path / "out" / "calibrated.toml").read_text(encoding="utf-8")
-    told, values, comments = tomllib.loads(RUN), tomllib.loads(text), comments_of(text)
+    told, values, comments = tomllib.loads(run), tomllib.loads(text), comments_of(text)
     chosen = json.loads((tmp_path / "out" / "calibration.json").read_text())["signs and orders"]["value"]
     expected = {**told, "assumed": ["shear's length", "bias", "medium's index", "sign of Δn"]}
     expected["microscope"]["condenser"]["na"] = 0.45
@@ -280,8 +281,9 @@ def test_a_calibrated_configuration_is_the_old_one_with_what_was_found(tmp_path,
     assert comments["acquisition.prisms[0]"].endswith("; bias assumed: a guess; so")
     assert comments["acquisition.prisms[1]"].startswith(f"mine; {angle}")
     assert comments["microscope.condenser"] == "calibrated: ± 0.02, told 0.5"
-    for key in ("microscope.objective", "volume.background", "data.path", "reconstruction.bounds"):
-        assert comments[key] == comments_of(RUN)[key]
+    unchanged = ("microscope.objective", "volume.background", "data.path", "reconstruction.bounds")
+    for key in (*unchanged, "calibration.length_within"):
+        assert comments[key] == comments_of(run)[key]
     assert load(tmp_path / "out" / "calibrated.toml").data == load(tmp_path / "run.toml").data
 
 

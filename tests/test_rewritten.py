@@ -132,6 +132,38 @@ def test_prisms_keep_the_files_of_their_images(tmp_path):
     assert "paths" not in told["data"]
 
 
+CALIBRATION = """
+[calibration]
+bead = { radius = 2.5, index = 1.59 }    # from its maker
+one_exposure = true
+bias_within_degrees = 3.0                # read twice
+angle_within = 0.02                      # rad
+"""
+
+
+def test_how_a_calibration_works_is_kept_with_its_comments(tmp_path, written):
+    """In the unit of its file, and in degrees where that says nothing."""
+    (tmp_path / "run.toml").write_text(TEXT + CALIBRATION, encoding="utf-8")
+    config, source = load(tmp_path / "run.toml"), Source.of(tmp_path / "run.toml")
+    text = rewritten(config, tmp_path, source, {})
+    told = tomllib.loads(CALIBRATION)["calibration"]
+    assert tomllib.loads(text)["calibration"] == told
+    comments, before = comments_of(text), comments_of(CALIBRATION)
+    assert {key: comments[key] for key in before} == before
+    assert same(again(config, tmp_path, source), config)
+    assert tomllib.loads(rewritten(config, tmp_path, written[1], {}))["calibration"] == {
+        **{key: value for key, value in told.items() if key != "angle_within"},
+        "angle_within_degrees": pytest.approx(math.degrees(0.02)),
+    }
+
+
+def test_how_closely_a_bead_tells_has_no_comment_of_what_was_told(tmp_path):
+    (tmp_path / "run.toml").write_text(TEXT + CALIBRATION, encoding="utf-8")
+    config, source = load(tmp_path / "run.toml"), Source.of(tmp_path / "run.toml")
+    text = rewritten_microscope(config, source, {})
+    assert not [key for key in comments_of(text) if key.startswith("calibration.")]
+
+
 def test_the_microscope_alone_is_what_other_stacks_include(tmp_path, written):
     config, source = written
     (tmp_path / "scope.toml").write_text(rewritten_microscope(config, source, {}), encoding="utf-8")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from recon.config.conversion import NONE, plain
 from recon.config.encoding import decoded
 from recon.config.including import relative_to, values_of
 from recon.config.schema import Config
-from recon.config.spelling import BRIGHT_FIELD, canonical
+from recon.config.spelling import BRIGHT_FIELD, DEGREES, WITHIN, canonical
 from torchdic import Prism
 from torchdic.scalar import number
 
@@ -37,10 +37,6 @@ class Source:
         for file in (*included, path):
             comments |= comments_of(decoded(file.read_bytes()))
         return cls(values, comments)
-
-    def without(self, section: str) -> "Source":
-        """The same, without a table."""
-        return replace(self, values={name: value for name, value in self.values.items() if name != section})
 
 
 def rewritten(
@@ -69,12 +65,11 @@ def rewritten_microscope(config: Config, source: Source, comments: Mapping[str, 
     prisms = [_prism(prism) for prism in config.acquisition.prisms]
     kept = {"microscope": values["microscope"], "acquisition": {"prisms": prisms}}
     known = config.calibration
-    kept["calibration"] = {
-        "length_within": _round(known.length_within),
-        "bias_within_degrees": _round(math.degrees(known.bias_within)),
-        "angle_within_degrees": _round(math.degrees(known.angle_within)),
-    }
-    return _text(kept, source, comments, head)
+    within = {name: getattr(known, name) for name in ("length_within", *WITHIN)}
+    kept["calibration"] = _in_degrees(within, ())
+    # what was said of how closely prisms were known before isn't true any more
+    others = {key: comment for key, comment in source.comments.items() if not key.startswith("calibration.")}
+    return _text(kept, replace(source, comments=others), comments, head)
 
 
 def _text(values: Table, source: Source, comments: Mapping[str, str], head: Sequence[str]) -> str:
@@ -118,6 +113,8 @@ def _spelled(config: Config, said: Table) -> Table:
         values["acquisition"]["prisms"] = [
             _prism(prism, was) for prism, was in zip(config.acquisition.prisms, named, strict=True)
         ]
+    if "calibration" in values:
+        values["calibration"] = _in_degrees(values["calibration"], said.get("calibration", ()))
     if not isinstance(acquisition.get("focus"), list) and "focus" in values["acquisition"]:
         values["acquisition"]["focus"] = _focus(values["acquisition"]["focus"])
     return values
@@ -151,6 +148,13 @@ def _prism(prism: Prism | None, was: Any = None) -> Any:
     if prism.axis is not None:
         told["axis_degrees"] = _round(math.degrees(number(prism.axis)))
     return told | where
+
+
+def _in_degrees(calibration: Table, said: Collection[str]) -> Table:
+    """How a calibration works, its angles in degrees but for those that the file says in rad."""
+    in_rad = {key: value for key, value in calibration.items() if key in WITHIN and key not in said}
+    kept = {key: value for key, value in calibration.items() if key not in in_rad}
+    return kept | {f"{key}{DEGREES}": _round(math.degrees(value)) for key, value in in_rad.items()}
 
 
 def _focus(planes: list[float]) -> Any:

@@ -19,7 +19,7 @@ ANGLES = ("bias", "polariser", "axis", "wedge")
 DEGREES = "_degrees"
 
 # How closely angles are known, in rad, each of which may be given in degrees.
-_WITHIN = ("bias_within", "angle_within")
+WITHIN = ("bias_within", "angle_within")
 
 # The keys of a layer that name its media, and what each stands for.
 _OF_LAYERS = {"depth": "thickness", "medium": "index", "design": "design_index"}
@@ -33,7 +33,7 @@ FURTHER: dict[str, tuple[str, ...]] = {
     "CompensatorSection": _OF_PRISMS,
     "WedgeSection": _OF_PRISMS,
     "Layer": tuple(_OF_LAYERS),
-    "CalibrationSection": tuple(f"{angle}{DEGREES}" for angle in _WITHIN),
+    "CalibrationSection": tuple(f"{angle}{DEGREES}" for angle in WITHIN),
 }
 
 # Sets of keys that exclude each other because they say the same, by the key of their table.
@@ -65,7 +65,7 @@ def canonical(values: Mapping[str, Any]) -> Table:
         known["volume"] = _volume(known["volume"])
     known = _with_layer(known)
     if isinstance(known.get("calibration"), dict):
-        known["calibration"] = _in_rad(known["calibration"], "calibration", _WITHIN)
+        known["calibration"] = _in_rad(known["calibration"], "calibration", WITHIN)
     if isinstance(known.get("acquisition"), dict):
         known["acquisition"] = _acquisition(known["acquisition"])
         if isinstance(known["acquisition"].get("prisms"), list):

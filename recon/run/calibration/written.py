@@ -37,8 +37,8 @@ def write_calibration(
     Raises WriteError where a file can't be written.
     """
     orders, found = calibration.orders, calibration.found
-    config = replace(calibration.config, calibration=CalibrationSection())
-    source = replace(source.without("calibration"), comments=corrected(source.comments, told.assumed))
+    config = calibration.config
+    source = replace(source, comments=corrected(source.comments, told.assumed))
     comments = provenance(told, config, orders, found, source.comments)
     head = [f"Written by torchdic calibrate ({__version__}), which found:"]
     head += [f"  {quantity.words}" for quantity in found]
