@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import tomllib
 from dataclasses import replace
 
@@ -142,6 +143,12 @@ def test_widths_are_those_of_a_ball_of_gauss():
     assert found.direction == 0.0
 
 
+@pytest.mark.parametrize("shape", [(1, 9, 9), (3, 1, 9), (3, 9, 1), (1, 1, 1), (2, 2, 2)])
+def test_along_an_axis_of_few_voxels_a_point_is_as_wide_as_the_volume(shape):
+    found = widths(torch.ones(shape, dtype=torch.float64), tuple(n // 2 for n in shape), (0.5, 0.2, 0.2))
+    assert (found.axial, found.finest, found.coarsest) == (math.inf, math.inf, math.inf)
+
+
 def test_a_point_is_widest_along_z():
     found = resolution_of(recording(focus=(-2.0, -1.0, 0.0, 1.0, 2.0)).coverage(EXPECTED))
     assert found.axial > 2 * found.coarsest >= 2 * found.finest > 0
@@ -226,6 +233,16 @@ def test_the_command_leaves_numbers_and_a_picture(covered, tmp_path):
     assert (tmp_path / "out" / "coverage.png").stat().st_size > 10000
     assert covered()[0] == 2  # the folder holds results
     assert covered(None, "--restart")[0] == 0
+
+
+def test_one_slice_tells_no_width_along_z(covered, tmp_path):
+    """As torchdic new makes of a single image."""
+    code, out, _ = covered({"volume": {"shape": [1, 24, 24]}, "acquisition": {"focus": [0.0]}}, "--suggest")
+    assert code == 0
+    assert re.search(r"a point's width +0\.\d+ µm across z.*, more than the volume's 0\.5 µm along z", out)
+    assert "inf" not in out
+    found = json.loads((tmp_path / "out" / "coverage.json").read_text(encoding="utf-8"))
+    assert found["point_width_um"]["axial"] is None
 
 
 def test_suggestions_are_ranked_by_what_they_add(covered, tmp_path):

@@ -189,6 +189,16 @@ def test_errors_of_numbers_are_those_of_the_refits():
     assert Known(1.0, 0.0, 0.3, 0.2).error == pytest.approx(0.3)
 
 
+def test_a_copy_whose_part_is_turned_out_of_the_field_tells_nothing_of_it():
+    outline, gone = (torch.full(GRID.shape, there, dtype=torch.bool) for there in (True, False))
+    delta = torch.full(GRID.shape, 0.02)
+    region = Region.within("all", outline, delta)
+    copies = [Refit("turned", i, delta * factor, delta) for i, factor in enumerate((0.9, 0.5))]
+    found = [Refit("noiseless", 0, delta), *copies]
+    told = known_measures(region, delta, GRID, 0.185, found, {0: outline, 1: gone})["mass"]
+    assert told.usual == pytest.approx(-0.1, rel=1e-4)
+
+
 def test_an_edge_that_is_not_known_is_an_error_of_the_number():
     """Copies whose contrast falls by a fifth: of a threshold found anew the volume stays, of the kept one it falls."""
     outline = torch.ones(GRID.shape, dtype=torch.bool)
@@ -283,6 +293,13 @@ def test_a_given_weight_that_falls_is_the_last_one_where_a_fit_goes_on():
     assert [prior.weight(0, 20) for prior in going_on.priors] == [5.0, 0.5]
     anew = problem.again(problem.misfit, step_of(ball()))
     assert anew.priors[0].weight(0, 20) == 60.0
+
+
+def test_a_fit_too_short_for_a_weight_by_its_noise_holds_the_first_one():
+    """As one of two steps is: its weight is by the contrast, and so is that of the refits."""
+    problem = problem_of(images())
+    again = problem.again(problem.misfit, replace(step_of(ball()), weights=()))
+    assert again.weight == replace(problem.weight, first=None, held=True)
 
 
 def test_bars_of_an_empty_volume_are_nothing():
@@ -386,6 +403,10 @@ def test_labels_that_are_none_of_the_volume_are_refused(done, folder, capsys):
     )
     tifffile.imwrite(folder / "none.tif", np.zeros((6, 26, 24), dtype=np.uint8), metadata={"axes": "ZYX"})
     assert "no label other than 0" in refused(folder, capsys, "--regions", str(folder / "none.tif"))
+    volume = str(done / "volume.ome.tif")
+    line = refused(folder, capsys, "--regions", volume)
+    assert f"{volume}: holds " in line
+    assert line.endswith(" where a label is wanted, which is a whole number; 0 is none")
 
 
 def test_a_folder_without_a_reconstruction_is_refused(tmp_path, capsys):

@@ -65,18 +65,20 @@ def widths(
     values, (z, y, x) = response.numpy(), place
     axial = width(values[:, y, x], z) * spacing[0]
     finest = min(spacing[1:])
-    reach = min(y * spacing[1], x * spacing[2]) / finest - 1
-    steps = np.arange(-int(reach), int(reach) + 1)
+    reach = max(int(min(y * spacing[1], x * spacing[2]) / finest - 1), 0)
+    steps = np.arange(-reach, reach + 1)
     across = []
     for angle in ANGLES:
         down, right = math.sin(math.radians(angle)) * finest, math.cos(math.radians(angle)) * finest
         at = [y + steps * down / spacing[1], x + steps * right / spacing[2]]
-        across.append(width(map_coordinates(values[z], at, order=3, mode="grid-wrap"), int(reach)) * finest)
+        across.append(width(map_coordinates(values[z], at, order=3, mode="grid-wrap"), reach) * finest)
     return Resolution(axial, min(across), max(across), float(ANGLES[int(np.argmax(across))]))
 
 
 def width(profile: NDArray[np.floating], middle: int) -> float:
     """Full width of a profile at half of its middle's value, in its steps; infinite where it doesn't fall so far."""
+    if len(profile) == 1:
+        return math.inf
     at = np.arange((len(profile) - 1) * FINE + 1) / FINE
     fine = CubicSpline(np.arange(len(profile)), profile)(at)
     centre = middle * FINE

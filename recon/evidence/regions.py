@@ -137,13 +137,16 @@ def _scattered(
     refits: Sequence[Refit],
     outlines: Mapping[int, Bool[Tensor, "z y x"]],
 ) -> dict[str, Scatter]:
-    """How each of a region's numbers scatters. measures: all of them in a volume, within an outline."""
+    """How each of a region's numbers scatters. measures: all of them in a volume, within an outline.
+
+    A copy tells nothing of a region that its turn has brought out of the field.
+    """
     (noiseless,) = (measures(refit.delta, region.outline) for refit in refits if refit.kind == "noiseless")
     noisy = [measures(refit.delta, region.outline) for refit in refits if refit.kind == "noise"]
     pairs = [
         (measures(refit.truth, outlines[refit.number]), measures(refit.delta, outlines[refit.number]))
         for refit in refits
-        if refit.truth is not None
+        if refit.truth is not None and bool(outlines[refit.number].any())
     ]
     return {
         name: (

@@ -177,7 +177,8 @@ class Problem:
         if given is not None:
             priors = [replace(p, first=p.last) if isinstance(p, Edges) else p for p in priors]
         if weight is not None:
-            weight = replace(weight, first=last.weights[-1]["tv"], held=True)
+            # of a descent too short for any, the first one, by the contrast
+            weight = replace(weight, first=last.weights[-1]["tv"] if last.weights else weight.first, held=True)
         careful = self.fidelity
         fidelity = GivenFidelity(careful.last(last.plans), careful.draft_sources, careful.matrices)
         return replace(self, misfit=misfit, unknowns=unknowns, priors=priors, fidelity=fidelity, weight=weight)

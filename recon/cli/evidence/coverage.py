@@ -106,7 +106,7 @@ def in_short(config: Config, source: str) -> str | None:
         return None
     found = _recording(config, source)[0].coverage(config.coverage, roughly=True)
     resolution = resolution_of(found)
-    point = f"a point's width {_across(resolution)}, {resolution.axial:.2g} µm along z"
+    point = f"a point's width {_widths(found, resolution)}"
     told = f"seen: {found.share:.0%} of the frequencies; {point} (torchdic coverage tells more)"
     lacks = shortcoming(found)
     return told if lacks is None else f"{told}\n{lacks}"
@@ -119,7 +119,7 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
         ("images", f"{len(recording.acquisition.prisms)} prism settings × {len(recording.focus)} planes"),
         ("noise", f"{' to '.join(noise[:: max(1, len(noise) - 1)])} % of the bright field, {how}"),
         ("seen", f"{found.share:.0%} of the frequencies that the apertures let through"),
-        ("a point's width", f"{_across(resolution)}, {resolution.axial:.2g} µm along z"),
+        ("a point's width", _widths(found, resolution)),
         ("Δn", f"known to ± {found.deviation:.2g}, before it ± {found.known_before:.2g}"),
     ]
     for period in PERIODS:
@@ -131,11 +131,27 @@ def _words(found: Coverage, resolution: Resolution, recording: NoisyAcquisition,
     return "\n".join(lines).rstrip()
 
 
-def _across(resolution: Resolution) -> str:
+def _widths(found: Coverage, resolution: Resolution) -> str:
+    """How wide a point gets across and along z."""
+    return f"{_across(found, resolution)}, {_along(found, resolution)} along z"
+
+
+def _along(found: Coverage, resolution: Resolution) -> str:
+    """How wide a point gets along z."""
+    return _within(resolution.axial, found.grid.extent[0])
+
+
+def _across(found: Coverage, resolution: Resolution) -> str:
     """How wide a point gets across z."""
-    finest, coarsest = (f"{width:.2g}" for width in (resolution.finest, resolution.coarsest))
-    worst = "" if finest == coarsest else f" ({coarsest} µm along {resolution.direction:g}°)"
-    return f"{finest} µm across z{worst}"
+    side = min(found.grid.extent[1:])
+    finest, coarsest = (_within(width, side) for width in (resolution.finest, resolution.coarsest))
+    worst = "" if finest == coarsest else f" ({coarsest} along {resolution.direction:g}°)"
+    return f"{finest} across z{worst}"
+
+
+def _within(width: float, most: float) -> str:
+    """A width in words: none is told beyond the volume's, which is `most`."""
+    return f"more than the volume's {most:.2g} µm" if math.isinf(width) else f"{width:.2g} µm"
 
 
 def _seen(along: float | None) -> str:
@@ -155,7 +171,7 @@ def _suggestions(found: Coverage, ranked: list[Ranked]) -> list[str]:
         images = "" if math.isclose(change.images, 1) else f", {change.images:.3g} × the images"
         adds = "next to nothing" if abs(gain) < NOTHING else f"{gain:+.0%}".replace("-", "−")
         lines.append(
-            f"  {adds:>15}  {change.name}: {resolution.axial:.2g} µm along z, Δn ± {other.deviation:.2g}{images}"
+            f"  {adds:>15}  {change.name}: {_along(other, resolution)} along z, Δn ± {other.deviation:.2g}{images}"
         )
     return lines
 

@@ -60,7 +60,10 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tensor, "z y x"]]]:
-    """The outlines of a file of labels, by name. Raises ConfigError where it isn't of the volume's shape or empty."""
+    """The outlines of a file of labels, by name.
+
+    Raises ConfigError where it isn't of the volume's shape, is empty, or holds what is no whole number.
+    """
     labels, shape = read_stack(file).data, done.config.volume.shape
     if labels.shape != (1, *shape):
         given, ours = (
@@ -70,8 +73,11 @@ def _outlines(file: Path, done: Reconstructed) -> Iterator[tuple[str, Bool[Tenso
     numbers = [number for number in np.unique(labels) if number != 0]
     if not numbers:
         raise ConfigError(f"{file}: holds no label other than 0: there is no region to measure")
+    broken = next((number for number in numbers if number != int(number)), None)
+    if broken is not None:
+        raise ConfigError(f"{file}: holds {broken:g} where a label is wanted, which is a whole number; 0 is none")
     for number in numbers:
-        yield f"region {number:g}", torch.from_numpy(labels[0] == number)
+        yield f"region {int(number)}", torch.from_numpy(labels[0] == number)
 
 
 def _words(found: ErrorBars, background: float) -> Iterator[str]:
