@@ -280,7 +280,7 @@ def test_a_reconstruction_without_data_is_refused(write, refused):
     ("changes", "words"),
     [
         ({"specimen": ...}, ["missing key specimen"]),
-        ({"specimen.kind": ...}, ["specimen.kind", "None", *map(repr, SPECIMENS)]),
+        ({"specimen.kind": ...}, ["missing key specimen.kind", *map(repr, SPECIMENS)]),
         ({"specimen.kind": "beed"}, ["specimen.kind", "'beed'", "'bead'"]),
         ({"specimen.kind": ["bead"]}, ["specimen.kind", "['bead']", "'bead'"]),
         ({"specimen.sgima": 1}, ["unknown key specimen.sgima", "did you mean 'sigma'"]),

@@ -400,6 +400,7 @@ def test_a_wrong_type_in_an_array_is_named_with_its_place(write, key, value, nam
         ("acquisition.prisms.0.shear", [0, math.inf], ["acquisition.prisms[0]", "shear x inf", "finite"]),
         ("fidelity.propagation", "waves", ["fidelity", "propagation", "'waves'", "of 'projection', 'rays', 'wave'"]),
         ("fidelity.sources", 0, ["fidelity", "sources 0", "at least 1"]),
+        ("simulation.seed", 2**64, ["simulation", "seed 18446744073709551616", "from -2^63 to 2^64 - 1"]),
         ("fidelity.steps", 0, ["fidelity", "steps 0", "at least 1"]),
         ("fidelity.object_aberration", "cone", ["fidelity", "'cone' has no use", "wave"]),
         (

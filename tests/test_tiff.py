@@ -311,7 +311,10 @@ def test_a_colour_image_is_refused(tmp_path, samples, planar):
     shape = (9, 7, samples) if planar == "contig" else (samples, 9, 7)
     extra = {"extrasamples": ["unassalpha"]} if samples == 4 else {}
     tifffile.imwrite(path, ramp(shape, np.uint8), photometric="rgb", planarconfig=planar, **extra)
-    assert f"colour image, {samples} samples per pixel" in the_error(path)
+    told = the_error(path)
+    assert f"colour image, {samples} samples per pixel" in told
+    # as tifffile writes an array of integers, of so many planes, where it isn't told that they are grey
+    assert ("if these are planes, write them with photometric='minisblack'" in told) == (planar == "separate")
 
 
 @pytest.mark.filterwarnings("ignore:.*are stored as RGB:DeprecationWarning")

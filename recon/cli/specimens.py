@@ -40,7 +40,9 @@ def specimen_of(config: Config, source: str) -> Any:
     if config.specimen is None:
         raise ConfigError(f"{source}: missing key specimen: a simulation needs one")
     values = dict(config.specimen)
-    kind = values.pop("kind", None)
+    if "kind" not in values:
+        raise ConfigError(f"{source}: missing key specimen.kind, which is one of {', '.join(map(repr, SPECIMENS))}")
+    kind = values.pop("kind")
     if not isinstance(kind, str) or kind not in SPECIMENS:
         raise ConfigError(f"{source}: specimen.kind: {kind!r} must be one of {', '.join(map(repr, SPECIMENS))}")
     values.setdefault("background", config.volume.background)

@@ -269,10 +269,15 @@ class SimulationSection:
 
     seed: of the camera's noise.
     exact: whether the images come from the specimen's exact field instead of a propagation.
+    Raises ValueError for a seed that torch's generator doesn't take.
     """
 
     seed: int = 0
     exact: bool = False
+
+    def __post_init__(self) -> None:
+        if not -(2**63) <= self.seed < 2**64:
+            raise ValueError(f"seed {self.seed} must be from -2^63 to 2^64 - 1")
 
 
 @dataclass(frozen=True)

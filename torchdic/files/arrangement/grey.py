@@ -12,18 +12,19 @@ _GREY, _PALETTE = 1, 3  # PhotometricInterpretation: the value grows with the li
 _PHOTOMETRIC = {0: "0 is white", 2: "RGB", 3: "a colour palette", 5: "CMYK", 6: "YCbCr", 8: "CIELab"}
 
 
-def coloured(path: Path, samples: int) -> StackError:
-    """The error for a colour image. samples: per pixel."""
+def coloured(path: Path, samples: int, *, apart: bool = False) -> StackError:
+    """The error for a colour image. samples: per pixel. apart: whether each has a plane of its own."""
+    planes = "; if these are planes, write them with photometric='minisblack' of tifffile.imwrite" if apart else ""
     return StackError(
         f"{path}: is a colour image, {samples} samples per pixel; a stack is grey: in Fiji, Image > Type > 16-bit, or "
-        "Image > Color > Split Channels and the channel of the light's colour, then File > Save As > Tiff…"
+        f"Image > Color > Split Channels and the channel of the light's colour, then File > Save As > Tiff…{planes}"
     )
 
 
 def check_grey(page: tifffile.TiffPage, path: Path) -> None:
     """Raise StackError where a page is coloured, or where its values do not grow with the light."""
     if page.samplesperpixel > 1:
-        raise coloured(path, page.samplesperpixel)
+        raise coloured(path, page.samplesperpixel, apart=page.planarconfig == tifffile.PLANARCONFIG.SEPARATE)
     if "PhotometricInterpretation" in page.tags and page.photometric not in (_GREY, _PALETTE):
         _refuse(page, path)
 
