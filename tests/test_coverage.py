@@ -299,3 +299,12 @@ def test_a_plan_says_what_is_seen_in_one_line(tmp_path, capsys):
         (tmp_path / "run.toml").write_text(text, encoding="utf-8")
         assert main(["plan", str(tmp_path / "run.toml"), "--device", "cpu"]) == 0
         assert ("of the frequencies; a point's width" in capsys.readouterr().out) is told
+
+
+def test_a_plan_whose_stack_is_too_small_to_tell_its_noise_is_a_plan(tmp_path, capsys):
+    row = CONFIG.replace("[8, 24, 24]", "[2, 1, 24]").replace("camera = { photons = 4000, read_noise = 2.0 }", "")
+    text = f'tolerance = 0.3\n{row}[specimen]\nkind = "bead"\nradius = 0.8\ncontrast = 0.02\n'
+    (tmp_path / "run.toml").write_text(f'{text}[data]\npath = "made/stack.ome.tif"\n', encoding="utf-8")
+    assert main(["simulate", str(tmp_path / "run.toml"), "--out", str(tmp_path / "made"), "--device", "cpu"]) == 0
+    assert main(["plan", str(tmp_path / "run.toml"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 0
+    assert (tmp_path / "out" / "plan.json").exists()

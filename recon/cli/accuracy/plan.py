@@ -37,11 +37,11 @@ def run(options: argparse.Namespace) -> None:
         prepare_folder(options.out)
     planned = torchdic.plan(volume, config.microscope, config.acquisition, tolerance)
     print(planned.table())
-    if (seen := in_short(config, str(options.config))) is not None:
-        print(f"\n{seen}")
     if options.out is not None:
         write_json(options.out / "plan.json", planned.as_dict())
         leave_resolved(config, options.out)
+    if (seen := in_short(config, str(options.config))) is not None:
+        print(f"\n{seen}")
 
 
 def _first_estimate(config: Config, source: str, device: torch.device) -> Volume:

@@ -48,7 +48,10 @@ def run(options: argparse.Namespace) -> None:
     """Print what an acquisition sees, and leave it as coverage.json and coverage.png."""
     check_no_results(options.out, (RESULTS,), restart=options.restart)
     config = load(options.config)
-    recording, how = _recording(config, str(options.config))
+    known = _recording(config, str(options.config))
+    if known is None:
+        raise ConfigError(f"{options.config}: the stack's noise can't be measured in images so small; give more pixels")
+    recording, how = known
     prepare_folder(options.out)
     expected = config.coverage
     found = recording.coverage(expected)
@@ -67,8 +70,11 @@ def run(options: argparse.Namespace) -> None:
     print(f"\n{options.out / RESULTS} and coverage.png")
 
 
-def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
-    """The recording that a configuration plans or names, and where its noise is from."""
+def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str] | None:
+    """The recording that a configuration plans or names, and where its noise is from.
+
+    None where the images are too small to tell it. Raises ConfigError where nothing tells it, or they show nothing.
+    """
     lacking = lacks_of_linear_response(config.microscope, config.acquisition)
     if lacking is not None:
         raise ConfigError(f"{source}: these images show nothing of a weak specimen: they need {lacking}")
@@ -76,7 +82,7 @@ def _recording(config: Config, source: str) -> tuple[NoisyAcquisition, str]:
     if config.data is not None and (_recorded(config) or photons is None):
         noise, how = load_data(config).noise, "measured in the stack"
         if noise is None:
-            raise ConfigError(f"{source}: the stack's noise can't be measured in images so small; give more pixels")
+            return None
     elif camera is not None and photons is not None:
         levels, how = empty_levels(config), f"of {photons:g} photons per pixel of the bright field"
         noise = [shot_noise(level, photons, camera.read_noise or 0.0) for level in levels]
@@ -99,12 +105,14 @@ def _photons(config: Config) -> float | None:
 
 
 def in_short(config: Config, source: str) -> str | None:
-    """What images of a configuration would tell, in one line; None where it says nothing of their noise."""
+    """What images of a configuration would tell, in one line; None where nothing tells their noise."""
     if not (_recorded(config) or _photons(config)):
         return None
     if lacks_of_linear_response(config.microscope, config.acquisition) is not None:
         return None
-    found = _recording(config, source)[0].coverage(config.coverage, roughly=True)
+    if (known := _recording(config, source)) is None:
+        return None
+    found = known[0].coverage(config.coverage, roughly=True)
     resolution = resolution_of(found)
     point = f"a point's width {_widths(found, resolution)}"
     told = f"seen: {found.share:.0%} of the frequencies; {point} (torchdic coverage tells more)"
