@@ -84,6 +84,17 @@ def test_a_tiles_voxels_lie_behind_its_pixels(ratio):
     assert max(axis.away(span.pixels.start) for span in axis.spans) <= ALIGNED
 
 
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.9, 3.3, 5.0, 8.0])
+@pytest.mark.parametrize("overlap", [4, 10])
+def test_the_smallest_tiles_are_tiles_whatever_the_pixels(ratio, overlap):
+    field, pixels = Grid((2, 400, 400), (0.3, 0.1, 0.1)), Grid((2, 80, 40), (0.3, 0.1 * ratio, 0.1 * ratio))
+    least = Layout.least_side(field, pixels, overlap)
+    axis = Layout.of(field, pixels, least, 4, overlap).along_x
+    assert torch.allclose(axis.weights_of_pixels().sum(0), torch.ones(40, dtype=torch.float64))
+    with pytest.raises(ValueError, match=f"tiles of {least - 1} voxels can't overlap by .*: of {least} they can"):
+        Layout.of(field, pixels, least - 1, 4, overlap)
+
+
 def test_a_tile_that_holds_the_field_is_the_field():
     (span,) = Axis.cut(40, 40, 1.0, 64, 8).spans
     assert (span.pixels, span.voxels) == (slice(0, 40), slice(0, 40))
@@ -540,7 +551,7 @@ def test_a_field_without_room_is_cut_into_tiles_as_large_as_the_memory(field, tm
         found[free] = cut.layout.side
         assert cut.memory <= free // 4
         assert cut.problem(whole).fidelity.fidelity.memory == cut.memory
-    assert least_side(margin_of_tiles(config)) <= found[12_000_000] < found[20_000_000]
+    assert least_side(whole, margin_of_tiles(config)) <= found[12_000_000] < found[20_000_000]
     with_budget = cut_of(config, whole, GaussianMisfit, 6_000_000)  # as half of the first
     assert with_budget is not None
     assert with_budget.layout.side == found[12_000_000]

@@ -55,15 +55,26 @@ class Axis:
 
     @classmethod
     def cut(cls, voxels: int, pixels: int, ratio: float, side: int, overlap: int) -> "Axis":
-        """An axis cut into tiles of at most `side` voxels, or a few less, such that pixels and voxels lie alike."""
+        """An axis cut into tiles of at most `side` voxels, or a few less, such that pixels and voxels lie alike.
+
+        Raises ValueError where the side is below `least`.
+        """
+        least = cls.least(ratio, overlap)
         if side >= voxels:
             return cls(voxels, pixels, ratio, pixels, voxels, overlap)
+        if side < least:
+            raise ValueError(f"tiles of {side} voxels can't overlap by {overlap} pixels: of {least} they can")
 
         def made(count: int) -> "Axis":
             return cls(voxels, pixels, ratio, int(count / ratio + 1e-6), count, overlap)
 
-        counts = range(side, max(side - SEARCHED, math.ceil((2 * overlap + 1) * ratio)) - 1, -1)
+        counts = range(side, max(side - SEARCHED, least) - 1, -1)
         return min((made(count) for count in counts), key=lambda axis: max(axis.away(0), ALIGNED))
+
+    @staticmethod
+    def least(ratio: float, overlap: int) -> int:
+        """Voxels of the smallest tile that has more pixels than two overlaps. ratio, overlap: as above."""
+        return math.ceil((2 * overlap + 1) * ratio)
 
     @cached_property
     def spans(self) -> tuple[Span, ...]:
@@ -144,14 +155,18 @@ class Layout:
         """Tiles of at most `side` voxels along y and x, which overlap by `overlap` voxels at least.
 
         field, pixels: the voxels behind the images, and the images' pixels. margin: as above.
-        Raises ValueError where the overlap isn't less than half of the side.
+        Raises ValueError where the side is below `least_side`.
         """
-        ratio = [p / d for p, d in zip(pixels.spacing, field.spacing, strict=True)]
-        axes = [
-            Axis.cut(field.shape[axis], pixels.shape[axis], ratio[axis], side, math.ceil(overlap / ratio[axis]))
-            for axis in (1, 2)
-        ]
-        return cls(axes[0], axes[1], side, margin)
+        along_y, along_x = (
+            Axis.cut(field.shape[axis], pixels.shape[axis], ratio, side, math.ceil(overlap / ratio))
+            for axis, ratio in zip((1, 2), _ratios(field, pixels), strict=True)
+        )
+        return cls(along_y, along_x, side, margin)
+
+    @staticmethod
+    def least_side(field: Grid, pixels: Grid, overlap: int) -> int:
+        """Voxels along a side of the smallest tiles that can overlap so. field, pixels, overlap: as of `of`."""
+        return max(Axis.least(ratio, math.ceil(overlap / ratio)) for ratio in _ratios(field, pixels))
 
     def __len__(self) -> int:
         return len(self.along_y.spans) * len(self.along_x.spans)
@@ -160,3 +175,8 @@ class Layout:
         for row, rows in enumerate(self.along_y.spans):
             for column, columns in enumerate(self.along_x.spans):
                 yield Tile(row * len(self.along_x.spans) + column, (row, column), rows, columns)
+
+
+def _ratios(field: Grid, pixels: Grid) -> list[float]:
+    """Voxels in a pixel along y and x."""
+    return [p / d for p, d in zip(pixels.spacing[1:], field.spacing[1:], strict=True)]

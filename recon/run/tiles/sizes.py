@@ -65,7 +65,7 @@ def cut_of(
     try:
         check_room_for_descent(problem, misfit)
     except ShortOfMemoryError:
-        if not small and (tiles != "auto" or least_side(margin) >= longest):
+        if not small and (tiles != "auto" or least_side(problem, margin) >= longest):
             raise
         side, memory = _with_room(problem, misfit, margin, budget, tiles if isinstance(tiles, int) else None)
         return Cut(_layout(problem, side, margin), memory)
@@ -87,7 +87,7 @@ def margin_of_tiles(config: Config) -> int:
 
 def _layout(problem: Problem, side: int, margin: int) -> Layout:
     """Tiles of a side. Raises ConfigError where they are too small for their overlaps."""
-    least = least_side(margin)
+    least = least_side(problem, margin)
     if side < least:
         raise ConfigError(
             f"reconstruction.tiles: {side} voxels are too few: light goes {margin} voxels to the side (margin), and "
@@ -96,9 +96,10 @@ def _layout(problem: Problem, side: int, margin: int) -> Layout:
     return Layout.of(problem.setup.field, problem.setup.pixels, side, margin, OVERLAP * margin)
 
 
-def least_side(margin: int) -> int:
-    """Voxels along a side of the smallest tiles."""
-    return 2 * OVERLAP * margin + LEAST_CORE
+def least_side(problem: Problem, margin: int) -> int:
+    """Voxels along a side of the smallest tiles: pixels of several voxels may ask for more of them."""
+    setup = problem.setup
+    return max(2 * OVERLAP * margin + LEAST_CORE, Layout.least_side(setup.field, setup.pixels, OVERLAP * margin))
 
 
 def _with_room(
@@ -119,7 +120,7 @@ def _with_room(
     one = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least / columns
     if side is None:
         largest = int(math.sqrt(min((budget - images) / beside, images / one))) - 2 * margin
-        side = max(largest, least_side(margin))
+        side = max(largest, least_side(problem, margin))
     wanted = math.ceil((beside + one) * (side + 2 * margin) ** 2)
     check_room(wanted, free, f"Tiles of {side} voxels and {margin} more on each side")
     return side, images
