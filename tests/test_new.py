@@ -591,6 +591,15 @@ def test_a_subtracted_background_is_one_line_and_may_be_put_back(tmp_path, recor
     assert abs((angle - 40 + 180) % 360 - 180) < 5
 
 
+def test_a_black_image_with_some_white_is_one_line(tmp_path, capsys):
+    image = np.zeros((26, 24), np.uint8)
+    image[10:16, 9:13] = 255
+    write_stack(tmp_path / "black.tif", image)
+    assert new(tmp_path / "black.tif", "--out", tmp_path / "run.toml") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "setting 1's background is 0 " in line
+
+
 def brightened(recording, share):
     """The recording with a share of its pixels at the camera's full scale, row by row."""
     data = recording.data.copy()

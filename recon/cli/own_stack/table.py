@@ -82,6 +82,7 @@ def _measured(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[R
     yield "background", f"{_range(levels)}{unit}", "measured"
     uneven = max(setting.unevenness for setting in found.settings)
     y, x = max((setting.tilt for setting in found.settings), key=lambda tilt: abs(tilt[0]) + abs(tilt[1]))
+    x, y = (round(tilt, 2) + 0.0 for tilt in (x, y))  # a −0 is 0
     yield "uneven light", f"{uneven:.0%} (tilt {x:+.0%} rightward, {y:+.0%} downward)", "measured, is divided out"
     if noises:
         yield "noise", f"{_range(noises)}{unit}", "measured"

@@ -141,8 +141,9 @@ def _setting(known: np.ndarray, flattened: np.ndarray, prism: int, pixel: tuple[
     level = float(np.median(curved))
     relative = 1 / level if level > 0 else 0.0
     field = ~specimens(flat)
-    field = field if field.any() else np.ones_like(field)
-    brightness = np.array([float(np.nanmedian((image / curved)[field])) for image in known])
+    field = (field if field.any() else np.ones_like(field)) & (curved > 0)
+    lit = [float(np.nanmedian(image[field] / curved[field])) if field.any() else 1.0 for image in known]
+    brightness = np.array(lit)
     mean = float(brightness.mean())
     return SettingSurvey(
         level=level,
