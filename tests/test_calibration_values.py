@@ -29,6 +29,7 @@ from recon.fit.problem import Recipe
 from recon.fit.setup import Setup
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
+from torchdic.errors import SamplingWarning
 
 pytestmark = pytest.mark.filterwarnings("ignore::torchdic.errors.WrapAroundWarning")
 rad = math.radians
@@ -266,6 +267,18 @@ def test_an_unknown_specimen_tells_the_shears_direction():
     error = found.value - math.atan2(0.06, 0.18)
     assert abs(error) < rad(3)
     assert abs(error) < 3 * max(found.deviation, rad(0.3))
+
+
+def test_trials_warn_of_no_aperture_of_theirs(recwarn):
+    """Voxels that are coarse for a trial's condenser say nothing of the user's."""
+    acquisition = Acquisition([Prism((0.0, 0.2), 1.4)], (-0.5, 0.5))
+    with torch.no_grad():
+        data = bead_images(acquisition, 20000.0, 0, Bead(1.2, 0.03, 1.4), (18, 18))
+    setup = part_of(data, None, Grid((4, 18, 18), (0.5, 0.2, 0.2))).setup(
+        1.4, Microscope(0.546, Objective(0.9), Condenser(0.8)), acquisition
+    )
+    Beside(part_of(data, None, setup.field), setup, Recipe(), [0.005], steps=1, sources=2).misfits(setup)
+    assert [str(warning.message) for warning in recwarn if warning.category is SamplingWarning] == []
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from recon.calibration.optics import CondenserAperture, ShearOfAxes, axes_of
 from recon.calibration.part import Part
 from recon.calibration.trials.profile import Least, least_misfit
-from recon.calibration.trials.short_fits import last_step
+from recon.calibration.trials.short_fits import last_step, unwarned
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.drift import Drift
 from recon.fit.nuisances.light import Brightness
@@ -100,7 +100,7 @@ class Beside:
         """The misfit of each image, relative to its prism's spatial variance, after a fit."""
         problem = self.problem(setup)
         last = self.last(problem)
-        with torch.no_grad():
+        with torch.no_grad(), unwarned():
             images = with_values(problem.unknowns, last.values, setup).images(Fidelity("wave", sources=self.sources))
         misfit = problem.misfit
         squares = misfit.where_counted((images - misfit.data).square()) / misfit.variance

@@ -5,7 +5,6 @@ volume is known, so that shear, bias and apertures are, too: nothing else can ex
 """
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -23,6 +22,7 @@ from recon.calibration.optics import (
     axes_of,
 )
 from recon.calibration.part import Part
+from recon.calibration.trials.short_fits import unwarned
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.base import Nuisance
 from recon.fit.nuisances.bias import Bias
@@ -34,7 +34,6 @@ from recon.fit.unknowns import with_values
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Fidelity, Grid, Microscope, Volume
-from torchdic.errors import SamplingWarning, WrapAroundWarning
 from torchdic.scalar import number
 
 # Thickness of a slab in µm, and the part of the field's width by which the model's is wider on each side.
@@ -114,9 +113,7 @@ def find_optics(
     setup = replace(model, acquisition=acquisition)
     misfit = GaussianMisfit(part.data, mask=part.mask)
     unknowns = _unknowns(setup)
-    with warnings.catch_warnings():
-        for kind in (SamplingWarning, WrapAroundWarning):
-            warnings.simplefilter("ignore", kind)
+    with unwarned():
         parameters = {u.name: u.start(setup, misfit) for u in unknowns}
         parameters |= _placed(setup, misfit, ROUNDS[0][0])
         coarse = parameters

@@ -53,8 +53,14 @@ def coarse_steps(problem: Problem, steps: int, sources: int, drafts: int | None 
     sources: condenser directions. drafts: those of images that are corrected to these; None is all of them.
     """
     coarse = GivenFidelity(Fidelity("wave", sources=sources), drafts)
-    with warnings.catch_warnings(), contextlib.suppress(FloatingPointError, UnstableError, SidewaysError):
-        # what is warned of for a trial's aperture says nothing of the user's
+    with unwarned(), contextlib.suppress(FloatingPointError, UnstableError, SidewaysError):
+        yield from minimise(replace(problem, fidelity=coarse, steps=steps, method="newton"))
+
+
+@contextlib.contextmanager
+def unwarned() -> Iterator[None]:
+    """Within this block images are those of trials: a warning of their apertures says nothing of the user's."""
+    with warnings.catch_warnings():
         for kind in (SamplingWarning, WrapAroundWarning):
             warnings.simplefilter("ignore", kind)
-        yield from minimise(replace(problem, fidelity=coarse, steps=steps, method="newton"))
+        yield
