@@ -1,4 +1,5 @@
 import argparse
+import json
 import os
 import re
 import subprocess
@@ -475,16 +476,27 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
         assert "dark" in line
 
 
-def test_a_simulation_is_replaced_by_another_one_only_where_the_user_says_so(write, run, tmp_path):
-    """As any results are; beside a reconstruction's configuration it may be the stack of that."""
+def test_a_simulation_is_replaced_by_another_one(write, run, tmp_path):
+    """It can be made again in seconds."""
     assert run("simulate", write())[0] == 0
     first = (tmp_path / "out" / "stack.ome.tif").read_bytes()
-    code, said = run("simulate", write({"microscope.objective.na": 0.6}))
+    assert run("simulate", write({"microscope.objective.na": 0.6}))[0] == 0
+    assert (tmp_path / "out" / "stack.ome.tif").read_bytes() != first
+
+
+@pytest.mark.parametrize("others", [{"reconstruct"}, {"simulate", "reconstruct"}, set()])
+def test_a_stack_of_other_results_or_from_elsewhere_is_replaced_only_on_request(write, run, tmp_path, others):
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("stack.ome.tif", "config.resolved.toml"):  # a reconstruction leaves the latter beside any stack
+        (out / name).write_text("precious")
+    (out / "run.json").write_text(json.dumps({name: {"command": f"torchdic {name}"} for name in others}))
+    code, said = run("simulate", write())
     assert code == 2
     assert "stack.ome.tif: the folder has results; name another one, or replace them with --restart" in said[-1]
-    assert (tmp_path / "out" / "stack.ome.tif").read_bytes() == first
-    assert run("simulate", write({"microscope.objective.na": 0.6}), "--restart")[0] == 0
-    assert (tmp_path / "out" / "stack.ome.tif").read_bytes() != first
+    assert (out / "stack.ome.tif").read_text() == "precious"
+    assert run("simulate", write(), "--restart")[0] == 0
+    assert (out / "stack.ome.tif").read_bytes()[:2] == b"II"
 
 
 @pytest.mark.filterwarnings("ignore::torchdic.WrapAroundWarning")

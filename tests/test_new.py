@@ -212,6 +212,14 @@ def test_which_file_is_which_setting_is_said(tmp_path, recording, capsys):
     assert joined.names == ("b_plus.tif", "a_minus.tif")
 
 
+def test_a_command_that_is_told_can_be_typed_as_it_is(tmp_path, recording, capsys):
+    stack = written(recording, tmp_path).rename(tmp_path / "my cell.tif")
+    assert new(stack) == 0
+    assert f"torchdic reconstruct '{tmp_path / 'my cell.toml'}' the volume" in capsys.readouterr().out
+    assert main(["plan", str(stack)]) == 2
+    assert f"torchdic new '{stack}' --out run.toml" in capsys.readouterr().err
+
+
 def test_one_plane_has_one_slice(tmp_path):
     stack = written(recorded((1.4,), planes=1), tmp_path)
     assert new(stack, "--out", tmp_path / "run.toml") == 0

@@ -5,6 +5,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from tqdm import tqdm
@@ -111,7 +112,7 @@ def _leave_report(options: argparse.Namespace, record: Record) -> None:
     except ForeignReportError as error:
         warnings.warn(str(error), UnsavedWarning, stacklevel=2)
     except WriteError as error:
-        raise NoReportError(f"{error}; make room, and torchdic report {out} makes it") from error
+        raise NoReportError(f"{error}; make room, and torchdic report {quote(str(out))} makes it") from error
 
 
 def _leave_index(options: argparse.Namespace) -> None:

@@ -18,6 +18,7 @@ from recon.report import figures
 from recon.run.data import camera_pixels
 from recon.run.exact_images import check_room_for_exact, exact_images
 from recon.run.folder.prepared import prepare_folder
+from recon.run.folder.record import recorded_in
 from recon.run.folder.results import check_no_results
 from recon.run.room import check_room_for_report
 from torchdic import STANDARD, Fidelity, Volume, image, plan
@@ -29,8 +30,13 @@ STACK = "stack.ome.tif"
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder."""
-    check_no_results(options.out, (STACK,), restart=options.restart)
+    """Simulate the configuration's specimen and leave stack.ome.tif and stack.png in the folder.
+
+    In a folder of a simulation alone that is replaced: it can be made again in seconds. A stack that came from
+    elsewhere can't, and beside other results it is what they are of.
+    """
+    simulated = recorded_in(options.out) == {"simulate"}
+    check_no_results(options.out, (STACK,), restart=options.restart or simulated)
     config = load(options.config)
     specimen = specimen_of(config, str(options.config))
     if config.simulation.exact and config.tolerance is not None:

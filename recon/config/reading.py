@@ -6,6 +6,7 @@ import os
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, Literal, TypeVar
 
 from cattrs import transform_error
@@ -58,7 +59,8 @@ def _check_no_images(path: Path) -> None:
     kind = "a folder" if folder else "an image" if path.name.lower().endswith(suffixes) else None
     if kind is not None and path.exists():
         raise ConfigError(
-            f"{path}: is {kind}, not a configuration; torchdic new {path} --out run.toml writes one for a stack"
+            f"{path}: is {kind}, not a configuration; torchdic new {quote(str(path))} --out run.toml writes one for a "
+            "stack"
         )
 
 

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
@@ -146,7 +147,8 @@ def tell_seen(config: Config, measured: Measured, delta: Float[Tensor, "z y x"])
 def _tell_of_earlier(out: Path) -> None:
     """Print where a folder has error bars of an earlier volume."""
     if (out / ERROR_BARS).exists():
-        print(f"{out / ERROR_BARS}: those of an earlier volume; find new ones with torchdic error-bars {out} --restart")
+        again = f"torchdic error-bars {quote(str(out))} --restart"
+        print(f"{out / ERROR_BARS}: those of an earlier volume; find new ones with {again}")
 
 
 def write_results(

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from shlex import quote
 
 from recon.cli.beside import beside
 from recon.cli.own_stack.options import SEVERAL, Given, add_options, given_of, in_radians
@@ -68,9 +69,10 @@ def run(options: argparse.Namespace) -> None:
     likely_wrong = [*in_radians(given), *(f"warning: {line}" for line in unlikely(config))]
     for line in (*warnings_of(gathered, found, settled), *likely_wrong):
         print(f"  {line}")
+    named = quote(str(out))
     print(
-        f"\nCorrect what is assumed in {out}. Then torchdic calibrate {out} finds what the images can tell, and "
-        f"torchdic reconstruct {out} the volume."
+        f"\nCorrect what is assumed in {out}. Then torchdic calibrate {named} finds what the images can tell, and "
+        f"torchdic reconstruct {named} the volume."
     )
 
 

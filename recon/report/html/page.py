@@ -6,6 +6,7 @@ from datetime import datetime
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import matplotlib as mpl
@@ -80,7 +81,9 @@ def leave_report(out: Path) -> Path | None:
     if kind is None:
         return None
     if not _is_ours(path):
-        raise ForeignReportError(f"{path}: isn't torchdic's: move it away, and torchdic report {out} makes one")
+        raise ForeignReportError(
+            f"{path}: isn't torchdic's: move it away, and torchdic report {quote(str(out))} makes one"
+        )
     write_text(path, page(folder, kind))
     return path
 

@@ -57,6 +57,11 @@ class Record:
         }
 
 
+def recorded_in(out: Path) -> set[str]:
+    """The commands whose records a folder holds."""
+    return set(_earlier(out / RECORD) or {})
+
+
 def _earlier(path: Path) -> dict[str, Any] | None:
     """The records of commands that are there; None where the file isn't of such."""
     if not path.exists():
