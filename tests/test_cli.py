@@ -476,6 +476,24 @@ def test_an_oil_objective_on_cells_in_medium_simulates_and_one_line_says_what_is
         assert "dark" in line
 
 
+LONG = "x" * 300
+
+
+@pytest.mark.parametrize("typed", [("simulate", f"{LONG}.toml"), ("phase", f"{LONG}.tif"), ("error-bars", LONG)])
+def test_a_name_that_no_file_can_have_is_one_line(tmp_path, monkeypatch, capsys, typed):
+    monkeypatch.chdir(tmp_path)
+    assert main([*typed, *([] if typed[0] == "error-bars" else ["--out", "out"])]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"torchdic: error: {LONG}")
+    assert line.endswith(": File name too long")
+
+
+def test_a_folder_whose_name_is_too_long_is_one_line(write, run, tmp_path):
+    code, said = run("simulate", write(), out=tmp_path / LONG)
+    assert code == 2
+    assert said[-1] == f"torchdic: error: {tmp_path / LONG}: File name too long"
+
+
 def test_a_simulation_is_replaced_by_another_one(write, run, tmp_path):
     """It can be made again in seconds."""
     assert run("simulate", write())[0] == 0

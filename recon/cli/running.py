@@ -1,6 +1,7 @@
 """A command that the user has chosen is run here: what happens to its errors and warnings."""
 
 import argparse
+import errno
 import sys
 import warnings
 from collections.abc import Callable
@@ -41,6 +42,10 @@ WRONG = (
 )
 
 
+# What the system says of a name that the user gives: it is too long, or lies where the user may not look.
+OF_NAMES = (errno.ENAMETOOLONG, errno.EACCES, errno.EPERM)
+
+
 class NoReportError(ResultsError):
     """Results are there, but the page that shows them can't be written: one line with the reason."""
 
@@ -61,6 +66,10 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
             _leave_index(options)
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)
+    except OSError as error:
+        if error.errno not in OF_NAMES or error.filename is None:
+            raise
+        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{_input(options)}{error}; the wave may cross it", BAD_INPUT)
     except (UnstableError, SidewaysError) as error:
