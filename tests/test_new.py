@@ -471,13 +471,23 @@ def setting(degrees, sure=3.0, likeness=(), *, signed=True, level=1000.0):
 LAYOUTS = {
     "one": ([setting(40)], [(40, 90)]),
     "a pair of biases": ([setting(38), setting(222, likeness=(-0.8,))], [(40, 90), (40, -90)]),
+    "a pair whose common blur hides the second's dipole": (
+        [setting(40, 3), setting(40, 15, likeness=(0.3,))],
+        [(40, 90), (40, -90)],
+    ),
     "two shears across": ([setting(40), setting(130, likeness=(0.9,))], [(40, 90), (130, 90)]),
     "two pairs": (
         [setting(41), setting(219), setting(309), setting(131)],
         [(40, 90), (40, -90), (310, 90), (310, -90)],
     ),
     "six frames: two shears with three biases": (
-        [setting(d) for d in (40, 40, 220, 130, 130, 310)],
+        [
+            setting(degrees, likeness=likeness)
+            for degrees, likeness in (
+                *((40, ()), (40, (0.8,)), (220, (0.2, 0.1))),
+                *((130, (0.3, 0.3, 0.3)), (130, (0.3, 0.3, 0.3, 0.8)), (310, (0.3, 0.3, 0.3, 0.2, 0.1))),
+            )
+        ],
         [(40, 90), (40, 90), (40, -90), (130, 90), (130, 90), (130, -90)],
     ),
     "six frames: two shears with bias −, 0, +": (

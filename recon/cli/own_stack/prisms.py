@@ -200,11 +200,17 @@ def _place(setting: SettingSurvey, axes: list[_Axis], places: Places, within: fl
         return near, likely
     shown = cmath.rect(1 / direction.uncertainty**2, direction.angle)
     for number, axis in enumerate(axes):
-        along = likely if not axis.shown else math.copysign(1.0, (shown / sum(axis.shown)).real)
-        apart = 0.0 if not axis.shown else abs(math.degrees(cmath.phase(along * shown / sum(axis.shown))))
+        mean = sum(axis.shown)
+        along = math.copysign(1.0, (shown / mean).real) if mean else likely
+        apart = abs(math.degrees(cmath.phase(along * shown / mean))) if mean else 0.0
         if apart < within:
+            if direction.signed and any(
+                place == (number, along) and like < _UNLIKE
+                for like, place in zip(setting.likeness, places, strict=True)
+            ):
+                along = -along  # images so unlike have another bias; what all settings see out of focus hides it
+            sign = along if direction.signed and (axis.signed or not axis.shown) else likely
             axis.shown.append(along * shown)
-            sign = along if direction.signed and (axis.signed or len(axis.shown) == 1) else likely
             axis.signed |= direction.signed
             return number, sign
     axes.append(_Axis([shown], direction.signed))

@@ -25,6 +25,9 @@ _NEIGHBOURS = 5
 # Pixels along a side of the smallest images that tell anything.
 SMALLEST = 16
 
+# Share of white noise's power that a Gaussian of one pixel's width lets through.
+_KEPT = 1 / (4 * math.pi)
+
 
 @dataclass(frozen=True, eq=False)
 class SettingSurvey:
@@ -35,7 +38,7 @@ class SettingSurvey:
     flicker: standard deviation of the planes' brightness; brightness: of each plane; both relative to their mean.
     noise: standard deviation of a pixel's noise, in the file's unit; None where images are too small to tell.
     direction: of the shear; None where the images show none.
-    likeness: correlation of the images with those of each setting before, from −1 to 1.
+    likeness: correlation of the images with those of each setting before, from −1 to 1; noise isn't counted.
     """
 
     level: float
@@ -158,12 +161,16 @@ def _setting(known: np.ndarray, flattened: np.ndarray, prism: int, pixel: tuple[
 
 
 def _likeness(images: np.ndarray, others: np.ndarray) -> float:
-    """The correlation of two settings' images, plane by plane."""
-    product = first = second = 0.0
-    for image, other in zip(images, others, strict=True):
-        a, b = ((smooth - smooth.mean()).ravel() for smooth in (ndimage.gaussian_filter(i, 1) for i in (image, other)))
-        product, first, second = product + float(a @ b), first + float(a @ a), second + float(b @ b)
-    return product / math.sqrt(first * second) if first * second > 0 else 0.0
+    """The correlation of two settings' images, plane by plane, of what isn't noise."""
+    product, powers = 0.0, np.zeros(2)
+    for pair in zip(images, others, strict=True):
+        a, b = ((smooth - smooth.mean()).ravel() for smooth in (ndimage.gaussian_filter(each, 1) for each in pair))
+        product += float(a @ b)
+        noise = np.array([(noise_level(each) or 0.0) ** 2 * each.size * _KEPT for each in pair])
+        powers += np.array([a @ a, b @ b]) - noise
+    if not (powers > 0).all():  # noise alone
+        return 0.0
+    return float(np.clip(product / math.sqrt(powers.prod()), -1, 1))
 
 
 def _camera(stack: Stack, flattened: np.ndarray, counted: np.ndarray | None) -> DarkCounts | None:
