@@ -12,6 +12,7 @@ import tomli_w
 import torch
 
 from recon.cli import main
+from recon.config.reading import load
 from recon.coverage.acquisition import NoisyAcquisition, shot_noise
 from recon.coverage.changes import changes
 from recon.coverage.expected import ExpectedSpecimen
@@ -219,6 +220,23 @@ def covered(tmp_path, capsys):
         return code, out, err
 
     return call
+
+
+@pytest.mark.parametrize("volume", [False, True])
+def test_beside_a_volume_the_configuration_that_it_was_fitted_with_stays(covered, tmp_path, volume):
+    """`error-bars` fits again by it."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "config.resolved.toml").write_text("of the fit", encoding="utf-8")
+    if volume:
+        (folder / "volume.ome.tif").write_bytes(b"")
+    assert covered()[0] == 0
+    kept = (folder / "config.resolved.toml").read_text(encoding="utf-8") == "of the fit"
+    assert kept is volume
+    own = folder / ("coverage.resolved.toml" if volume else "config.resolved.toml")
+    assert load(own).acquisition.focus == (-1.0, 0.0, 1.0)
+    if volume:
+        assert "coverage.resolved.toml" in (folder / "README.txt").read_text(encoding="utf-8")
 
 
 def test_the_command_leaves_numbers_and_a_picture(covered, tmp_path):

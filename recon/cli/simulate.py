@@ -11,7 +11,6 @@ from torch import Tensor
 
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
-from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.planned import announce
 from recon.report import figures
@@ -20,6 +19,7 @@ from recon.run.exact_images import check_room_for_exact, exact_images
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.record import recorded_in
 from recon.run.folder.results import check_no_results
+from recon.run.results import leave_configuration
 from recon.run.room import check_room_for_report
 from torchdic import STANDARD, Fidelity, Volume, image, plan
 from torchdic.files.stack import equal_step, write_stack
@@ -85,7 +85,7 @@ def _planned(config: Config, volume: Volume, tolerance: float, out: Path) -> Fid
     print(f"{announce(planned)}, predicted {planned.seconds:.2g} s", flush=True)
     write_json(out / "plan.json", planned.as_dict())
     resolved = replace(config, fidelity=planned.fidelity, tolerance=None)
-    leave_resolved(resolved, out, announce(planned))
+    leave_configuration(resolved, out, "simulate", announce(planned))
     return planned.fidelity
 
 
@@ -102,6 +102,6 @@ def _write(config: Config, images: Tensor, out: Path) -> None:
     write_stack(out / STACK, data, pixel, equal_step(focus))
     figures.save(figures.draw_stack(images.float(), acquisition.prisms, focus, pixel), out / "stack.png")
     if config.tolerance is None:  # otherwise the plan has left it
-        leave_resolved(config, out)
+        leave_configuration(config, out, "simulate")
     prisms, planes, ny, nx = images.shape
     print(f"{out / STACK}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")

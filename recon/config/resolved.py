@@ -9,9 +9,9 @@ from torchdic.files.whole import write_text
 RESOLVED = "config.resolved.toml"
 
 
-def leave_resolved(config: Config, out: Path, *notes: str) -> None:
+def leave_resolved(config: Config, out: Path, *notes: str, name: str = RESOLVED) -> None:
     """Write a configuration with every key and its value into a folder. Raises WriteError.
 
-    notes: lines that stand above it as comments.
+    notes: lines that stand above it as comments. name: the file's.
     """
-    write_text(out / RESOLVED, "".join(f"# {note}\n" for note in notes) + dump(config))
+    write_text(out / name, "".join(f"# {note}\n" for note in notes) + dump(config))

@@ -208,6 +208,16 @@ def write_results(
     return Result(delta, found)
 
 
+def leave_configuration(config: Config, out: Path, command: str, *notes: str) -> None:
+    """Leave what a command other than a reconstruction has run with. Raises WriteError.
+
+    Where the folder holds a volume, config.resolved.toml is what that was fitted with, and stays: the file is then
+    named after the command. notes: lines that stand above it as comments.
+    """
+    name = f"{command}.resolved.toml" if (out / VOLUME).exists() else RESOLVED
+    leave_resolved(config, out, *notes, name=name)
+
+
 def leave_interrupted(out: Path, delta: Float[Tensor, "z y x"], field: Grid, told: str) -> Path:
     """Write the volume of an interrupted descent, to be looked at; returns its file.
 

@@ -10,7 +10,6 @@ from tqdm import tqdm
 
 from recon.cli.specimens import specimen_of
 from recon.config.reading import load
-from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.fit.step import Step
 from recon.report import figures
@@ -23,6 +22,7 @@ from recon.run.fits.ladder import fits_of
 from recon.run.fits.trials import Recorded, fit_trials
 from recon.run.folder.prepared import prepare_folder
 from recon.run.interruption import InterruptedRunError, signals_kept
+from recon.run.results import leave_configuration
 from torchdic.files.format import Stack
 
 
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
     recorded = _recorded(config, str(options.config), options.device)
     kept = KeptTrials(options.out, recorded, earlier)
     prepare_folder(options.out)
-    leave_resolved(config, options.out)
+    leave_configuration(config, options.out, "work-precision")
     _try_each(recorded, candidates, kept)
     found = [trial for candidate in candidates for trial in kept.trials if trial.candidate == candidate]
     print(fits_table(found))

@@ -8,12 +8,12 @@ import torchdic
 from recon.cli.evidence.coverage import in_short
 from recon.cli.specimens import specimen_of, voxels
 from recon.config.reading import load
-from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.earlier.tikhonov import tikhonov
 from recon.fit.setup import Setup, empty_medium
 from recon.run.data import load_data
 from recon.run.folder.prepared import prepare_folder
+from recon.run.results import leave_configuration
 from recon.run.room import check_room_for_direct
 from torchdic import Volume
 from torchdic.files.whole import write_json
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     print(planned.table())
     if options.out is not None:
         write_json(options.out / "plan.json", planned.as_dict())
-        leave_resolved(config, options.out)
+        leave_configuration(config, options.out, "plan")
     if (seen := in_short(config, str(options.config))) is not None:
         print(f"\n{seen}")
 

@@ -10,7 +10,6 @@ from tqdm import tqdm
 from recon.cli.accuracy import fits
 from recon.cli.specimens import check_exact_field, specimen_of, voxels
 from recon.config.reading import load
-from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.report import figures
 from recon.report.fronts import as_dict, as_table, draw_fronts, write_csv
@@ -18,6 +17,7 @@ from recon.run.exact_images import exact_images
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
 from recon.run.interruption import InterruptedRunError
+from recon.run.results import leave_configuration
 from torchdic import Candidate, Fidelity, Trial
 from torchdic.files.whole import write_json
 from torchdic.planning.comparisons import TRUTH
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     candidates = config.candidates or ladder(grid, padded=not reaches_a_side(volume))
     reference = _references(config, candidates)
     prepare_folder(options.out)
-    leave_resolved(replace(config, candidates=candidates), options.out)
+    leave_configuration(replace(config, candidates=candidates), options.out, "work-precision")
     exact = None
     if hasattr(specimen, "field"):
         # the exact field is lit from as many directions as the truth that it replaces

@@ -9,7 +9,6 @@ from typing import Any
 from tqdm import tqdm
 
 from recon.config.reading import load
-from recon.config.resolved import leave_resolved
 from recon.config.schema import Config, ConfigError
 from recon.coverage.acquisition import NoisyAcquisition, shot_noise
 from recon.coverage.changes import Change, changes
@@ -22,6 +21,7 @@ from recon.report import figures
 from recon.run.data import empty_levels, load_data
 from recon.run.folder.prepared import prepare_folder
 from recon.run.folder.results import check_no_results
+from recon.run.results import leave_configuration
 from torchdic.files.whole import write_json
 from torchdic.scalar import number
 
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
         print("\n" + "\n".join(_suggestions(found, ranked)))
     figures.save(draw_coverage(found, _axis(config)), options.out / "coverage.png")
     write_json(options.out / RESULTS, _as_dict(found, resolution, recording, ranked))
-    leave_resolved(config, options.out)
+    leave_configuration(config, options.out, "coverage")
     print(f"\n{options.out / RESULTS} and coverage.png")
 
 

@@ -50,6 +50,10 @@ FILES = {
     "fits.csv": "the same as a table",
     "run.json": "what was typed, the time and memory that it took, and versions",
     "config.resolved.toml": "the configuration with every key, as it was used",
+    **{
+        f"{command}.resolved.toml": f"the same of torchdic {command}, which ran after the reconstruction"
+        for command in ("simulate", "plan", "coverage", "work-precision")
+    },
 }
 
 

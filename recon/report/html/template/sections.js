@@ -24,8 +24,8 @@
   function colours() {
     let [low, high] = [Number(from.value), Number(to.value)];
     if (map.value === "RdBu_r") {
-      const zero = (-255 * volume().low) / (volume().high - volume().low);
-      const reach = Math.max(Math.abs(low - zero), Math.abs(high - zero));
+      const zero = (-255 * volume().low) / (volume().high - volume().low || 1);
+      const reach = Math.max(Math.abs(low - zero), Math.abs(high - zero)) || 1;
       [low, high] = [zero - reach, zero + reach];
     }
     return report.colours(maps[map.value], low, high);
