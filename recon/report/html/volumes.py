@@ -40,6 +40,7 @@ KINDS = (
     Kind("wave.ome.tif", "Δn by the wave"),
     Kind("rays.ome.tif", "Δn by bent rays"),
     Kind("projection.ome.tif", "Δn by straight rays"),
+    Kind("truth.ome.tif", "Δn as it is"),
     Kind("volume.interrupted.ome.tif", "Δn of a later, interrupted run"),
 )
 
