@@ -85,7 +85,7 @@ def graded() -> Together:
 
 def setups() -> dict[str, scenes.Setup]:
     """The scenes by name."""
-    acquisition = scenes.acquisition(scenes.SHEARS, (math.pi / 2, -math.pi / 2), FOCUS)
+    acquisition = scenes.acquisition(scenes.SHEARS, (math.pi / 2,), FOCUS)
     usual = scenes.Setup("tiles", beads(), FIELD, acquisition=acquisition, photons=20000.0)
     return {
         "beads": usual,

@@ -33,7 +33,7 @@ from recon.fit.unknowns import IndexDifference, check_saved, with_values
 from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import BEGUN, WeightRecord, record
+from recon.prior.weight import BEGUN, WeightRecord, record, whiteness
 from torchdic import Fidelity
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
@@ -88,9 +88,8 @@ class Place:
     resumed descent makes again. split: of the last model. correction: of the draft images.
     weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
     know it. width: of edges, over the last one. misled: whether few directions mislead here, so that each step has all.
-    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit by which the weight
-    goes, one accepted step earlier. moved: whether the last step was accepted. still: accepted steps in a row that
-    changed next to nothing.
+    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit one accepted step
+    earlier. moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
     pairs: for the secants. records: of the weight.
     """
 
@@ -439,16 +438,13 @@ class _Descent:
         rule = self.problem.weight
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
-        misfit, white = self.heeded(now), rule.white(now.images, self.problem.misfit)
+        white = whiteness(now.images, self.problem.misfit)
         past = place.records or (record(0, place.weight, "by the contrast"),)
-        weight, reason = rule.next(past, misfit, place.before, white, EDGE * place.scale / self.problem.setup.dilution)
-        made = record(number + 1, weight, reason, misfit, white)
+        weight, reason = rule.next(
+            past, now.misfit, place.before, white, EDGE * place.scale / self.problem.setup.dilution
+        )
+        made = record(number + 1, weight, reason, now.misfit, white)
         return replace(place, weight=weight, records=(*place.records, made))
-
-    def heeded(self, now: Judged) -> float:
-        """The misfit by which the priors' weight goes."""
-        rule = self.problem.weight
-        return now.misfit if rule is None else rule.heeded(now.images, now.misfit)
 
     def advanced(
         self, place: Place, now: Judged, hessian: WeakHessian, drafted: tuple[Fidelity, Fidelity | None], number: int
@@ -485,12 +481,12 @@ class _Descent:
         still = place.still + 1 if -actual < STILL * objective and self.steady(place, number) else 0
         if share < BAD and -predicted < STILL * objective:
             # the place is the minimum with these weights: it counts as reached, so that the weights go on
-            onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=self.heeded(now))
+            onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.misfit)
             return replace(onward, still=still), now
         if share < BAD:
             there = self.judged(formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
-        onward = replace(onward, accepted=place.accepted + 1, before=self.heeded(now), moved=True, still=still)
+        onward = replace(onward, accepted=place.accepted + 1, before=now.misfit, moved=True, still=still)
         there, onward = self.renewed(onward, formed, *drafted)
         pairs, rise = self.remembered(place, now, there, step), there.misfit - now.misfit + penalties
         if rise > CREEP * objective:
