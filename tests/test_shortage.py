@@ -128,8 +128,10 @@ def test_every_kind_of_shortage_is_known_and_told_in_one_line():
         assert told.startswith("the memory ran out: another ")
         assert "were asked for; fewer voxels" in told
         assert "\n" not in told
-    other = RuntimeError("shapes differ")
-    assert as_shortage(other) is other
+    for other in (RuntimeError("shapes differ"), ImportError("No module named 'a'")):
+        assert as_shortage(other) is other
+    # of a library that is first used where there is no room for it
+    assert is_shortage(ImportError("_lsprof.so: failed to map segment from shared object"))
 
 
 def test_the_processs_own_limit_is_free_memory_too(tmp_path):

@@ -81,7 +81,7 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
-    except (MemoryError, RuntimeError) as error:
+    except (MemoryError, RuntimeError, ImportError) as error:
         if not is_shortage(error):
             raise
         return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)

@@ -25,8 +25,9 @@ from torchdic.memory.shortage import as_shortage, is_shortage
 
 LOG, CHECKPOINT = "log.csv", "checkpoint.pt"
 
-# What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (torch's is the last).
-STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError)
+# What a step may fail by: the fit diverges, its light can't be followed, there is no room for it (the last three, see
+# `torchdic.memory.shortage`).
+STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError, ImportError)
 
 # Seconds from which on it is worth some more to foresee the memory, too.
 LONG = 60.0

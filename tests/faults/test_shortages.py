@@ -27,7 +27,8 @@ FORESEEN = {
     "plan, of a stack": ("", 112, f"A volume of 8×320×320 voxels by method 'linear' {NEED}"),
     "calibrate": ("", 48, "the memory ran out"),
     "reconstruct": ("", 160, f"Steps of a reconstruction of 8×320×320 voxels {NEED}"),
-    "reconstruct, planned": ("", 160, f"Steps of a reconstruction of 8×320×320 voxels {NEED}"),
+    # its tiles would have room, its results have none
+    "reconstruct, planned": ("", 160, f"Pictures and files of the results {NEED}"),
     "reconstruct, linear": ('method = "linear"\n', 160, f"A volume of 8×320×320 voxels by method 'linear' {NEED}"),
     "reconstruct, opl": ('method = "opl"\n', 96, f"Pictures and files of the results {NEED}"),
 }

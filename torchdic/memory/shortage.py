@@ -19,9 +19,14 @@ _ASKED = re.compile(r"allocate ([\d.]+) (\w+)")
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether an error says that memory ran out: Python's, NumPy's, or torch's, which on the CPU is a RuntimeError."""
+    """Whether an error says that memory ran out: Python's, NumPy's, or torch's, which on the CPU is a RuntimeError.
+
+    torch loads some of its libraries when they are first used: where there is no room for one, that is an ImportError.
+    """
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
+    if isinstance(error, ImportError):
+        return "failed to map segment" in str(error)
     return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
 
 

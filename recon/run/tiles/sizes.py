@@ -68,6 +68,8 @@ def cut_of(
         if not small and (tiles != "auto" or least_side(problem, margin) >= longest):
             raise
         side, memory = _with_room(problem, misfit, margin, budget, tiles if isinstance(tiles, int) else None)
+        if side >= longest:  # such tiles are no part of the field
+            raise
         return Cut(_layout(problem, side, margin), memory)
     return Cut(_layout(problem, tiles, margin), memory) if small and isinstance(tiles, int) else None
 
@@ -107,20 +109,22 @@ def _with_room(
 ) -> tuple[int, int]:
     """The side of the largest tiles in a budget of bytes, or a given one, and the bytes that their images may take.
 
-    Raises ShortOfMemoryError where these tiles, or the smallest, have no room.
+    Where the largest are no smaller than the field, their room isn't looked at. Raises ShortOfMemoryError where tiles
+    of the given side, or the smallest, have no room.
     """
     setup, free = problem.setup, free_bytes(problem.misfit.data.device)
     assert free is not None  # else there was no lack of it
     budget = budget or int(SHARE * free)
     images = min(_memory(problem), budget // 2)
     problem = _with_memory(problem, images)
-    assert isinstance(problem.fidelity, GivenFidelity)  # for others no room is checked
-    fidelity, columns = problem.fidelity.fidelity, math.prod(setup.volume.grid.shape[1:])
+    fidelity, columns = problem.fidelity.coarse, math.prod(setup.volume.grid.shape[1:])
     beside = held_beside_images(problem, misfit, fidelity) / columns
     one = foreseen(setup.volume, setup.microscope, setup.acquisition, fidelity, gradient=True).least / columns
     if side is None:
         largest = int(math.sqrt(min((budget - images) / beside, images / one))) - 2 * margin
         side = max(largest, least_side(problem, margin))
+        if side >= max(setup.field.shape[1:]):
+            return side, images
     wanted = math.ceil((beside + one) * (side + 2 * margin) ** 2)
     check_room(wanted, free, f"Tiles of {side} voxels and {margin} more on each side")
     return side, images
