@@ -15,7 +15,7 @@ demo: $(INSTALLED)
 	$(BIN)/torchdic demo --out demo --restart
 
 # tests run side by side, each on one thread: a test's tensors are too small for more
-test test-all: export OMP_NUM_THREADS := 1
+test test-all faults: export OMP_NUM_THREADS := 1
 # what one process compiles is kept for the others
 test test-all faults: export PYTHONDONTWRITEBYTECODE :=
 PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
