@@ -104,9 +104,12 @@ def strength(delta: Tensor, grid: Grid, wavelength: float) -> float:
 
     delta: Δn (z, y, x). wavelength: µm.
     """
-    delta = delta.detach()
-    path = float(delta.sum(0).abs().max()) * grid.spacing[0] / wavelength
-    return max(float(delta.abs().max()) / LEAST_DELTA, path / LEAST_PATH, 1.0)
+    return max(float(delta.detach().abs().max()) / LEAST_DELTA, path_of(delta, grid, wavelength) / LEAST_PATH, 1.0)
+
+
+def path_of(delta: Tensor, grid: Grid, wavelength: float) -> float:
+    """The largest |OPD| of a volume along z, in wavelengths. delta: Δn (z, y, x). wavelength: µm."""
+    return float(delta.detach().sum(0).abs().max()) * grid.spacing[0] / wavelength
 
 
 def follow(plans: tuple[PlanRecord, ...], step: int, setup: Setup, tolerance: float) -> tuple[PlanRecord, ...]:

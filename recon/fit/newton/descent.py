@@ -25,7 +25,7 @@ from recon.fit.newton.secants import MEMORY, Pair, Secants
 from recon.fit.newton.weak_hessian import WeakHessian, check_linear_response
 from recon.fit.nuisances.base import Nuisance
 from recon.fit.nuisances.refinement import refined
-from recon.fit.planned import PlanRecord
+from recon.fit.planned import PlanRecord, path_of
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.step import Step, check_convergence
@@ -382,15 +382,14 @@ class _Descent:
 
     def expected_misled(self) -> bool:
         """See the function of this name."""
-        fidelity = self.problem.fidelity
+        setup, fidelity = self.problem.setup, self.problem.fidelity
         careful = fidelity.last(())
-        (first, _), (_, fine) = (drafts(each, fidelity.draft_sources) for each in (fidelity.coarse, careful))
+        first, fine = drafts(careful, fidelity.draft_sources)
         if self.index.given is not None or fine.sources >= careful.sources:
             return False
         place, hessian, now = self.start(first, None)
         delta = self.bounds.clamped(self.linear(place, hessian, now, SMOOTH)).detach()
-        path = float(delta.sum(0).abs().max()) * self.problem.setup.volume.grid.spacing[0]
-        if 2 * math.pi * path / self.problem.setup.microscope.wavelength < WEAK:
+        if 2 * math.pi * path_of(delta, setup.volume.grid, setup.microscope.wavelength) < WEAK:
             return False
         self.responses(place.responding, fine, careful)
         place = replace(place, delta=delta)
