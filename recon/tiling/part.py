@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from recon.fit.newton.descent import known_contrast
 from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
@@ -20,6 +19,7 @@ from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknown, with_support
 from recon.misfit.base import Misfit
 from recon.misfit.level import image_means
+from recon.prior.base import contrast
 from recon.prior.weight import FollowsNoise
 from recon.tiling.layout import Layout, Span, Tile
 
@@ -43,7 +43,7 @@ class SharedByTiles:
         weight = last.weights[-1]["tv"] if problem.weight is not None and last.weights else None
         own = {u.name for u in problem.unknowns if _is_of_tile(u)}
         values = {name: value for name, value in last.values.items() if name not in own}
-        return cls(problem.misfit, weight, known_contrast(last), values)
+        return cls(problem.misfit, weight, contrast(last.delta), values)
 
 
 def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:

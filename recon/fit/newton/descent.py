@@ -11,7 +11,7 @@ actual to the predicted decrease (J. Moré's rule for λ of Levenberg and Marqua
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from recon.fit.newton.correction import Correction, drafts
 from recon.fit.newton.missed import MissedResponse
+from recon.fit.newton.place import WIDE, Formed, Judged, Place, restored, state_of
 from recon.fit.newton.proximal import Penalties, Split, minimised
 from recon.fit.newton.secants import MEMORY, Pair, Secants
 from recon.fit.newton.weak_hessian import WeakHessian, check_linear_response
@@ -29,18 +30,18 @@ from recon.fit.planned import PlanRecord, path_of
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup
 from recon.fit.step import Step, check_convergence
-from recon.fit.unknowns import IndexDifference, check_saved, with_values
+from recon.fit.unknowns import IndexDifference, with_values
 from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import BEGUN, WeightRecord, record, whiteness
+from recon.prior.weight import BEGUN, record, whiteness
 from torchdic import Fidelity
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
 
-# λ over the Hessian's mean: at first, the least, and the factors by which the ratio of actual to predicted decrease
-# moves it (ratios above GOOD, below POOR, and below BAD, where the step is taken back).
-FIRST, LEAST = 0.3, 3e-3
+# The least λ over the Hessian's mean, and the factors by which the ratio of actual to predicted decrease moves it
+# (ratios above GOOD, below POOR, and below BAD, where the step is taken back).
+LEAST = 3e-3
 # Above it no step is long enough to change anything, and the descent ends.
 MOST = 1e6
 GOOD, POOR, BAD = 0.7, 0.3, 0.05
@@ -49,8 +50,8 @@ SHORTER, LONGER, BACK = 2.0, 0.4, 4.0
 # Accepted steps before the priors know the specimen's contrast, and before the weight follows the noise.
 UNTIL_CONTRAST, UNTIL_WEIGHT = 3, 2
 
-# Edges are wide at first, by this factor from one accepted step to the next: a logarithm at once keeps false edges.
-WIDE, NARROWER = 1.0 / EDGE, 0.75
+# Edges are narrower by this factor from one accepted step to the next: a logarithm at once keeps false edges.
+NARROWER = 0.75
 
 # Steps with the fewest directions.
 COARSE_STEPS = 4
@@ -78,71 +79,6 @@ ASTRAY, ABOVE_NOISE = 0.004, 0.1
 
 # A descent ends where two accepted steps in a row have changed objective and weight by less than these shares.
 STILL, STEADY = 2e-5, 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where a descent stands: all that is needed to go on, besides what the problem says.
-
-    delta: Δn (z, y, x). parameters: of the nuisances, by name. responding: those that the Hessian was made for, which a
-    resumed descent makes again. split: of the last model. correction: of the draft images.
-    weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
-    know it. width: of edges, over the last one. misled: whether few directions mislead here, so that each step has all.
-    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit one accepted step
-    earlier. moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
-    pairs: for the secants. records: of the weight.
-    """
-
-    delta: Float[Tensor, "z y x"]
-    parameters: dict[str, Tensor]
-    responding: dict[str, Tensor]
-    split: Split
-    correction: Correction
-    weight: float
-    scale: float
-    known: bool = False
-    width: float = WIDE
-    misled: bool = False
-    damping: float = FIRST
-    accepted: int = 0
-    before: float | None = None
-    moved: bool = True
-    still: int = 0
-    pairs: tuple[Pair, ...] = ()
-    records: tuple[WeightRecord, ...] = ()
-
-    @property
-    def edge(self) -> float:
-        """The width of an edge, in Δn."""
-        return EDGE * self.scale * (self.width if self.known else 1.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Formed:
-    """The images of a volume, with their graph.
-
-    delta: Δn, the graph's leaf. images: as the microscope forms them, on the volume's pixels. recorded: with the
-    correction and the nuisances of a place. misfit: of those, a 0-d tensor.
-    """
-
-    delta: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus y x"]
-    recorded: Float[Tensor, "prism focus row column"]
-    misfit: Float[Tensor, ""]
-
-    @property
-    def value(self) -> float:
-        """The misfit as a number."""
-        return float(self.misfit.detach())
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A volume's misfit, its gradient, and the recorded images of the model."""
-
-    misfit: float
-    gradient: Float[Tensor, "z y x"]
-    images: Float[Tensor, "prism focus row column"]
 
 
 def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
@@ -191,7 +127,7 @@ class _Descent:
         place, first, seconds = None, 0, 0.0
         if resume is not None:
             names = [unknown.name for unknown in problem.unknowns]
-            place = _restored(resume.state, names, problem.misfit.data.device)
+            place = restored(resume.state, names, problem.misfit.data.device)
             first, seconds, self.plans = resume.number, resume.seconds, resume.plans
         hessian = now = None
         for number in range(first, problem.steps):
@@ -218,7 +154,7 @@ class _Descent:
             except NO_IMAGES:  # of the drafts' directions, or of the careful ones
                 place = self.taken_back(place)
             taken, values = seconds + time.perf_counter() - started, self.values(place)
-            yield Step(number + 1, misfit, loss, place.delta, taken, values, _state(place), self.plans, place.records)
+            yield Step(number + 1, misfit, loss, place.delta, taken, values, state_of(place), self.plans, place.records)
 
     def drafted(self, place: Place | None, number: int) -> tuple[Fidelity, Fidelity | None, bool]:
         """The fidelity of a step's images, the careful one to which they are corrected, if any, and whether they turn.
@@ -519,44 +455,3 @@ class _Descent:
             return False
         last, previous = place.records[-1]["tv"], place.records[-2]["tv"]
         return abs(math.log(last / previous)) < STEADY
-
-
-def known_contrast(last: Step) -> float:
-    """The specimen's contrast as a descent's priors knew it in the end, or that of its last volume."""
-    newton = last.state.get("newton")
-    return newton["scale"] if newton is not None and newton["known"] else contrast(last.delta)
-
-
-def _state(place: Place) -> dict[str, dict[str, Any]]:
-    """A place as plain values and tensors, for a checkpoint."""
-    numbers = {f.name: getattr(place, f.name) for f in fields(Place)}
-    for name in ("delta", "parameters"):
-        del numbers[name]
-    numbers |= {"split": vars(place.split), "correction": vars(place.correction)}
-    return {
-        "delta": {"parameter": place.delta},
-        **{name: {"parameter": parameter} for name, parameter in place.parameters.items()},
-        "newton": numbers,
-    }
-
-
-def _restored(state: dict[str, dict[str, Any]], names: list[str], device: torch.device) -> Place:
-    """The place that `_state` saved. names: of the descent's unknowns. Raises ValueError where it saved others."""
-    if "newton" not in state:
-        raise ValueError("the saved step is none of Newton's method")
-    saved = [name for name in state if name != "newton"]
-    check_saved(names, saved)
-    values = dict(_moved(state["newton"], device))
-    for name, kind in (("split", Split), ("correction", Correction)):
-        values[name] = kind(**values[name])
-    parameters = {n: v["parameter"].to(device) for n, v in state.items() if n not in ("delta", "newton")}
-    return Place(state["delta"]["parameter"].to(device), parameters, **values)
-
-
-def _moved(value: Any, device: torch.device) -> Any:
-    """A value with all tensors in it on a device."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, dict):
-        return {name: _moved(below, device) for name, below in value.items()}
-    return tuple(_moved(below, device) for below in value) if isinstance(value, tuple) else value
