@@ -367,8 +367,8 @@ def test_what_was_measured_of_a_told_angle_is_not_said_of_another(tmp_path):
 def trials(to, noise, fall, lowest=1.0):
     """The least misfit of trials with a parabola about a value, which falls by a share of the noise from 0 to there."""
 
-    def misfits_at(value):
-        return np.full(4, noise * (lowest + fall * (value / to - 1) ** 2))
+    def misfits_at(values):
+        return [np.full(4, noise * (lowest + fall * (value / to - 1) ** 2)) for value in values]
 
     return least_misfit(misfits_at, 0.0, 0.12, noise, 60000, (-1, 1))
 

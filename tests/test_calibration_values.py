@@ -85,28 +85,33 @@ def test_unequal_levels_are_refused():
 # --- trials -----------------------------------------------------------------------------------------------------------
 
 
+def each(misfits_at):
+    """Of several values."""
+    return lambda values: map(misfits_at, values)
+
+
 def test_the_least_of_a_parabola_is_found_wherever_it_lies():
     for true in (-0.3, 0.02, 0.31):
-        found = least_misfit(lambda v, t=true: np.full(4, 0.1 + (v - t) ** 2), 0.0, 0.12, 0.1, 1000, (-1, 1))
+        found = least_misfit(each(lambda v, t=true: np.full(4, 0.1 + (v - t) ** 2)), 0.0, 0.12, 0.1, 1000, (-1, 1))
         assert found.value == pytest.approx(true, abs=1e-9)
         assert found.deviation == pytest.approx(math.sqrt(0.1 / 1000), rel=0.1)  # σ² = noise over curvature and pixels
 
 
 def test_images_that_disagree_make_the_least_uncertain():
     places = np.array([-0.05, 0.05, 0.02, -0.02])
-    found = least_misfit(lambda v: 0.1 + (v - places) ** 2, 0.0, 0.12, 0.1, 10**9, (-1, 1))
+    found = least_misfit(each(lambda v: 0.1 + (v - places) ** 2), 0.0, 0.12, 0.1, 10**9, (-1, 1))
     assert found.value == pytest.approx(0.0, abs=1e-9)
     assert found.deviation == pytest.approx(places.std(ddof=1) / 2, rel=1e-6)  # the error of a mean of four
 
 
 def test_a_misfit_without_a_least_within_the_limits_tells_nothing():
-    assert least_misfit(lambda v: np.array([0.1 + 0.01 * v]), 0.0, 0.12, 0.1, 100, (-1, 1)).deviation == math.inf
+    assert least_misfit(each(lambda v: np.array([0.1 + 0.01 * v])), 0.0, 0.12, 0.1, 100, (-1, 1)).deviation == math.inf
 
 
 def test_noise_that_volumes_absorb_makes_the_least_uncertain():
     """Where the best volume leaves less than the noise, that it leaves still less elsewhere may be freedom alone."""
     absorbed, curvature, pixels = 0.002, 1.0, 1000
-    found = least_misfit(lambda v: np.full(4, 0.098 + (v - 0.05) ** 2), 0.0, 0.12, 0.1, pixels, (-1, 1))
+    found = least_misfit(each(lambda v: np.full(4, 0.098 + (v - 0.05) ** 2)), 0.0, 0.12, 0.1, pixels, (-1, 1))
     assert found.deviation == pytest.approx(math.sqrt((0.1 / pixels + FREEDOM * absorbed) / curvature), rel=1e-6)
     assert found.absorbed == pytest.approx(absorbed / 0.1)
     assert found.told == pytest.approx(0.098 + 0.05**2)

@@ -37,6 +37,7 @@ from torchdic.errors import BatchWarning
 from torchdic.forward.own_part import OwnPart
 from torchdic.linear import transfer_functions
 from torchdic.ranks.agreement import gathered
+from torchdic.ranks.each import each
 from torchdic.ranks.group import alone, rank, ranks, shares_out
 from torchdic.ranks.meeting import _answered, _called
 from torchdic.ranks.shared import _parts, everywhere, shared
@@ -213,6 +214,31 @@ def test_everywhere_runs_a_function_on_all_ranks(tmp_path):
     assert led(lambda: everywhere(by_itself, tmp_path), 3, tmp_path) == [([0, 1, 2], 3)] * 3
     assert all((tmp_path / str(number)).exists() for number in range(3))
     assert everywhere(by_itself, tmp_path) == [([0], 1)]
+
+
+def squared(item):
+    """An item that says who computed it, and that nothing of it was shared out."""
+    if item == 13:
+        raise ValueError("13 isn't liked")
+    return item**2, rank(), shares_out()
+
+
+def test_each_of_many_items_is_computed_by_one_rank(tmp_path):
+    def body():
+        with pytest.raises(ValueError, match="13 isn't liked"):
+            list(each(squared, [1, 13]))
+        return list(each(squared, range(5)))
+
+    who = [0, 1, 2, 0, 1]
+    assert led(body, 3, tmp_path) == [(i**2, number, False) for i, number in enumerate(who)]
+    assert list(each(squared, range(5))) == [(i**2, 0, False) for i in range(5)]
+
+
+def test_items_come_as_soon_as_they_are_there():
+    seen = []
+    items = each(lambda item: seen.append(item) or item, [3, 4])
+    assert next(items) == 3
+    assert seen == [3]
 
 
 def gone(which):

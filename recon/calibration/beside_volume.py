@@ -6,7 +6,7 @@ too, which out of focus shows a specimen's Δn without any prism. Two settings t
 Brightness and drift of each image show beside any volume.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from recon.fit.step import Step
 from recon.fit.unknowns import with_values
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Fidelity
+from torchdic.ranks.each import each
 
 # Steps and condenser directions of a fit.
 STEPS, SOURCES = 8, 18
@@ -111,10 +112,10 @@ class Beside:
         counted = int(self.misfit.pixels.sum())
         with tqdm(desc=name, unit="volume") as bar:
 
-            def misfits_at(value: float) -> np.ndarray:
-                found = self.misfits(changed(value))
-                bar.update()
-                return found
+            def misfits_at(values: Sequence[float]) -> Iterator[np.ndarray]:
+                for found in each(self.misfits, [changed(value) for value in values]):
+                    bar.update()
+                    yield found
 
             return least_misfit(misfits_at, 0.0, step, self.alone, counted, limits)
 

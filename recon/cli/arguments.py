@@ -67,6 +67,17 @@ def device(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def processes(parser: argparse.ArgumentParser) -> None:
+    """How many processes compute together."""
+    parser.add_argument(
+        "--processes",
+        type=_processes,
+        default=1,
+        metavar="N",
+        help="compute with N processes, as many as there are cores to spare; each needs memory (default: 1)",
+    )
+
+
 def earlier_run(parser: argparse.ArgumentParser) -> None:
     """What to do with an earlier run that is found in the folder."""
     choice = parser.add_mutually_exclusive_group()
@@ -158,6 +169,17 @@ def _folder(name: str) -> Path:
     except ConfigError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return Path(name)
+
+
+def _processes(text: str) -> int:
+    """A number of processes."""
+    from recon.cli.processes.torchrun import place
+
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number of processes, 1 or more")
+    if int(text) > 1 and (found := place()) is not None:
+        raise argparse.ArgumentTypeError(f"{text}: torchrun has started {found.ranks} processes already")
+    return int(text)
 
 
 def _device(name: str) -> Any:

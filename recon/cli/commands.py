@@ -53,6 +53,8 @@ class Command:
         return getattr(import_module(self.module), "SEVERAL", ()) if self.own else ()
 
 
+_COMPUTING = (arguments.device, arguments.processes)
+
 COMMANDS = {
     "demo": Command(
         "recon.cli.demo",
@@ -104,19 +106,19 @@ COMMANDS = {
         "recon.cli.calibrate",
         "find signs, orders and values of the optics, as far as the images of a stack tell them",
         "calibrate run.toml --out run_calibration",
-        (arguments.config, partial(arguments.out, what="calibration"), arguments.device, arguments.restart),
+        (arguments.config, partial(arguments.out, what="calibration"), *_COMPUTING, arguments.restart),
     ),
     "reconstruct": Command(
         "recon.cli.reconstruct",
         "find the refractive-index volume behind a stack of DIC images",
         "reconstruct run.toml --out run_volume",
-        (arguments.config, partial(arguments.out, what="volume"), arguments.device, arguments.earlier_run),
+        (arguments.config, partial(arguments.out, what="volume"), *_COMPUTING, arguments.earlier_run),
     ),
     "error-bars": Command(
         "recon.cli.evidence.error_bars",
         "tell how far each voxel of a reconstruction, and the numbers of its parts, can be trusted",
         "error-bars run_volume --regions labels.tif",
-        (arguments.device, arguments.restart),
+        (*_COMPUTING, arguments.restart),
         own=True,
     ),
     "view": Command(
@@ -190,6 +192,10 @@ def _run(typed: Sequence[str] | None) -> int:
         from recon.cli.running import run
 
         command = import_module(chosen.module).run
+    if getattr(options, "processes", 1) > 1:
+        from recon.cli.processes.started import by_several
+
+        return by_several(options.processes, partial(run, command, options))
     return run(command, options)
 
 

@@ -51,17 +51,18 @@ def check_room_for_volume(grid: Grid, device: torch.device) -> None:
     check_volume(grid, ARRAYS, device)
 
 
-def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> None:
+def check_room_for_descent(problem: Problem, misfit: Callable[[Tensor], Misfit], at_once: int = 1) -> None:
     """Raise ShortOfMemoryError where a descent would take more memory than is free.
 
-    misfit: makes the problem's misfit from data. Where the fidelity has yet to be planned, what the descent holds
-    beside its images is checked: each image is, when it is computed.
+    misfit: makes the problem's misfit from data. at_once: number of such descents on this machine. Where the fidelity
+    has yet to be planned, what the descent holds beside its images is checked: each image is, when it is computed.
     """
     free = free_bytes(problem.misfit.data.device)
-    if free is None or _ample(problem.setup) <= free:
+    if free is None or at_once * _ample(problem.setup) <= free:
         return
-    wanted = bytes_at_least(problem, misfit)
-    check_room(wanted, free, f"Steps of a reconstruction of {_named(problem.setup.volume.grid)} voxels")
+    wanted = at_once * bytes_at_least(problem, misfit)
+    several = f", {at_once} at once," if at_once > 1 else ""
+    check_room(wanted, free, f"Steps of a reconstruction of {_named(problem.setup.volume.grid)} voxels{several}")
 
 
 def bytes_held(problem: Problem, misfit: Callable[[Tensor], Misfit]) -> int:

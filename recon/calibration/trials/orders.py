@@ -17,8 +17,8 @@ from tqdm import tqdm
 from recon.calibration.trials.declared import Otherwise, all_mistakes, images_of
 from recon.calibration.trials.short_fits import last_step
 from recon.fit.problem import Problem, Recipe
-from recon.fit.step import Step
 from torchdic import Acquisition
+from torchdic.ranks.each import each
 
 
 class Round(NamedTuple):
@@ -106,7 +106,7 @@ def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, no
         race.run([other for other in every if other.mistakes > LIKELY], 1, recipe)
     for number in range(2, len(ROUNDS) + 1):
         racing = race.best(ROUNDS[number - 1].most)
-        recipe = _held(recipe, race.fitted(racing[0], number, recipe))
+        recipe = _held(recipe, _fitted((race.problem(racing[0], number, recipe), ROUNDS[number - 1])).weight)
         race.run(racing, number, recipe)
     ranked = sorted(race.tried.values(), key=lambda tried: (-tried.rounds, tried.loss))
     return _chosen(tuple(ranked), race.alone, race.pixels)
@@ -125,17 +125,18 @@ class _Race:
 
     def run(self, racing: Sequence[Otherwise], number: int, recipe: Recipe) -> None:
         """Fit each description as a round asks for."""
-        for other in tqdm(racing, desc=f"signs and orders, round {number} of {len(ROUNDS)}", unit="fit"):
-            last = self.fitted(other, number, recipe)
-            misfit, loss = (math.inf, math.inf) if last is None else (last.misfit, last.loss)
-            self.tried[_key(other)] = Tried(other, misfit, misfit if number == 1 else loss, number)
+        problems = [self.problem(other, number, recipe) for other in racing]
+        fits = each(_fitted, [(problem, ROUNDS[number - 1]) for problem in problems])
+        with tqdm(desc=f"signs and orders, round {number} of {len(ROUNDS)}", unit="fit", total=len(racing)) as bar:
+            for other, fit in zip(racing, fits, strict=True):
+                self.tried[_key(other)] = Tried(other, fit.misfit, fit.misfit if number == 1 else fit.loss, number)
+                bar.update()
 
-    def fitted(self, other: Otherwise, number: int, recipe: Recipe) -> Step | None:
-        """The last step of a description's short fit; None where its light can't be followed."""
-        this = ROUNDS[number - 1]
-        problem = self._problem_of(other.acquisition, this.slices, recipe)
+    def problem(self, other: Otherwise, number: int, recipe: Recipe) -> Problem:
+        """A description's short fit in a round."""
+        problem = self._problem_of(other.acquisition, ROUNDS[number - 1].slices, recipe)
         self.alone, self.pixels = problem.misfit.of_noise(self._noise) or 0.0, int(problem.misfit.pixels.sum())
-        return last_step(problem, this.steps, this.sources)
+        return problem
 
     def best(self, most: int) -> list[Otherwise]:
         """The best so many of the last round, and the declared one, with which the others are compared."""
@@ -150,11 +151,26 @@ class _Race:
         return left[0] < STANDS_OUT * left[len(left) // 2]
 
 
-def _held(recipe: Recipe, last: Step | None) -> Recipe:
+class _Fit(NamedTuple):
+    """The misfit of a short fit's volume, also with priors, and their weight; infinite and None without a volume."""
+
+    misfit: float = math.inf
+    loss: float = math.inf
+    weight: float | None = None
+
+
+def _fitted(asked: tuple[Problem, Round]) -> _Fit:
+    """A description's short fit; without a volume where its light can't be followed."""
+    problem, this = asked
+    last = last_step(problem, this.steps, this.sources)
+    if last is None:
+        return _Fit()
+    return _Fit(last.misfit, last.loss, float(last.weights[-1]["tv"]) if last.weights else None)
+
+
+def _held(recipe: Recipe, weight: float | None) -> Recipe:
     """The recipe with the priors' weight held at what it came to; as it is where that isn't known."""
-    if recipe.tv != "auto" or last is None or not last.weights:
-        return recipe
-    return recipe.held(float(last.weights[-1]["tv"]))
+    return recipe if recipe.tv != "auto" or weight is None else recipe.held(weight)
 
 
 def _chosen(ranked: tuple[Tried, ...], noise: float, pixels: int) -> Orders:

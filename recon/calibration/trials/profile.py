@@ -1,7 +1,7 @@
 """A value by trials: a volume is fitted with each, and a parabola through the misfits has its least there."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +17,8 @@ WITHIN = 0.6
 # alone may change the misfit by this share of what was absorbed.
 FREEDOM = 0.1
 
-# The misfit of each image, relative to its prism's spatial variance, of a volume that was fitted with a value.
-MisfitsAt = Callable[[float], Float[np.ndarray, " image"]]
+# The misfit of each image, relative to its prism's spatial variance, of volumes that were fitted with values.
+MisfitsAt = Callable[[Sequence[float]], Iterable[Float[np.ndarray, " image"]]]
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ def least_misfit(
     """
     known: dict[float, np.ndarray] = {}
 
-    def at(value: float) -> np.ndarray:
-        if value not in known:
-            known[value] = misfits_at(value)
-        return known[value]
+    def at(values: Sequence[float]) -> Float[np.ndarray, "trial image"]:
+        new = [value for value in values if value not in known]
+        known.update(zip(new, misfits_at(new), strict=True))
+        return np.stack([known[value] for value in values])
 
     middle, least = first, first
     for narrow in (False, True):
@@ -68,7 +68,7 @@ def least_misfit(
             values = [min(max(middle + sign * wide, limits[0]), limits[1]) for sign in (-1, 0, 1)]
             if len(set(values)) < 3:
                 return Least(first, math.inf, _table(known))
-            misfits = np.stack([at(value) for value in values])
+            misfits = at(values)
             curvature, least = _parabola(values, misfits.mean(1))
             if curvature <= 0 or abs(least - middle) > WITHIN * wide:
                 best = values[int(misfits.mean(1).argmin())]

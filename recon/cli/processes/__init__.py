@@ -1,1 +1,1 @@
-"""One command by several processes, as torchrun starts them."""
+"""One command by several processes, as torchrun starts them, or the command itself."""

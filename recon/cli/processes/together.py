@@ -13,12 +13,13 @@ from torchdic.ranks.shared import follow, leading
 from torchdic.ranks.signals import ignore_signals
 
 
-def take_part(place: ProcessPlace, command: Callable[[], int]) -> int:
+def take_part(place: ProcessPlace, command: Callable[[], int], method: str = "env://") -> int:
     """Run a command as the process in a place; returns the process's exit code.
 
-    All but the first are silent, and end when the first one does.
+    All but the first are silent, and end when the first one does. method: how they find each other, see
+    `torchdic.ranks.group.joined`.
     """
-    with joined(Group(*place)):
+    with joined(Group(*place), method):
         if place.rank == 0:
             with leading():
                 return command()

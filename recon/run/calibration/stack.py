@@ -20,6 +20,7 @@ from recon.recording.preparation import Measured
 from recon.run.data import camera_pixels, load_data
 from recon.run.room import check_room_for_descent
 from torchdic import Acquisition, Fidelity, Grid, Microscope
+from torchdic.ranks.group import ranks_here
 
 # Slices of the volumes by which signs and orders are told, before a round has fewer.
 COARSE = 20
@@ -91,7 +92,7 @@ class CalibrationStack:
         setup = part.setup(self.config.volume.background, self.microscope, self.config.acquisition)
         problem = Problem.from_recipe(part.data, setup, Fidelity("wave"), recipe, noise=self.noise)
         if can_be_tried(problem):
-            check_room_for_descent(problem, GaussianMisfit)
+            check_room_for_descent(problem, GaussianMisfit, at_once=ranks_here())
 
     def beside(self, planes: int = PLANES) -> Beside:
         """The part of the stack beside a volume that is fitted to it; the volume goes on where the specimen is cut."""
