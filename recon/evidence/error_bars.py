@@ -33,10 +33,10 @@ def error_bars(
     problem: that was fitted. step: the last of the fit, as `solved` returns it; None fits now.
     noise: of the images, in the unit of the data: the camera's, or the standard deviation of each prism's; None is
     measured in them.
-    noisy, copies: how many fits there are of other noise and of turned copies, at least 2 each.
+    noisy: number of fits to other noise. copies: number of turned copies. At least 2 of each.
     increment: of the index with concentration, ml/g, by which dry mass is told.
-    outlines: boolean volumes (z, y, x) by name, True within what is drawn around a part of the field; what stands out
-    in it is measured like the whole specimen.
+    outlines: boolean volumes (z, y, x) by name, True within what is drawn around a part; what stands out in it is
+    measured as the whole specimen is.
     Raises ValueError for fewer fits, an outline of another shape, and noise that can't be measured, NotImplementedError
     for a misfit that can't be made of other images, and what `minimise` raises.
     """
