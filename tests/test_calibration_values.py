@@ -1,6 +1,7 @@
 """Values of a calibration: from levels, from a known specimen and from trials; each within its uncertainty."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -243,7 +244,7 @@ def test_errors_of_a_bead_are_within_three_deviations(monkeypatch, seed):
     assert abs(math.log(length)) < min(3 * float(found.deviations["shear"][0, 0]), 0.05)
 
 
-def test_a_specimen_that_is_not_there_is_told():
+def test_what_a_calibration_cannot_be_of_is_told():
     bead = Bead(1.2, 0.06, 1.4)
     noise = 1 + 0.01 * torch.randn(1, 2, 32, 30, generator=torch.Generator().manual_seed(0))
     told = told_setup(Acquisition([Prism((0.0, 0.2), 1.4)], (0.0, 1.0)), noise)
@@ -251,6 +252,11 @@ def test_a_specimen_that_is_not_there_is_told():
         calibrate(noise, told, ModelledSpecimen(bead.delta, 2.4, 2.4))
     with pytest.raises(ValueError, match=r"shape \(1, 1, 32, 30\), the acquisition and grid ask for \(1, 2, 32, 30\)"):
         calibrate(noise[:, :1], told, ModelledSpecimen(bead.delta, 2.4, 2.4))
+    with pytest.raises(ValueError, match="the noise is given of 2 prisms, the data have 1"):
+        calibrate(noise, told, ModelledSpecimen(bead.delta, 2.4, 2.4), [0.01, 0.01])
+    bare = replace(told, microscope=Microscope(0.546))
+    with pytest.raises(ValueError, match=r"aberrations \[11\] are of an objective, and the microscope has none"):
+        calibrate(noise, bare, ModelledSpecimen(bead.delta, 2.4, 2.4), zernike=[11])
 
 
 def test_a_calibration_takes_seven_planes_and_some_light_around_the_bead(monkeypatch):

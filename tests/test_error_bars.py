@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from absolute import Absolute
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from small_bead import CONFIG
@@ -349,12 +350,19 @@ def test_the_noise_of_each_pixel_is_the_cameras_or_its_prisms():
         ({"noisy": 1}, "noisy 1 must be at least 2"),
         ({"copies": 0}, "copies 0 must be at least 2"),
         ({"noise": [0.1, 0.1]}, "the noise is given of 2 prisms, the data have 1"),
-        ({"outlines": {"half": torch.ones(2, 3, 4) > 0}}, r"'half' has shape \(2, 3, 4\), the field \(8, 24, 20\)"),
+        ({"noise": [-0.1]}, "the noise -0.1 of prism 1 must be at least 0 and finite"),
+        ({"outlines": {"half": torch.ones(2, 3, 4) > 0}}, r"'half' is torch.bool of shape \(2, 3, 4\), it must be"),
     ],
 )
 def test_what_error_bars_cannot_be_of_is_refused(given, line):
     with pytest.raises(ValueError, match=line):
-        error_bars(problem_of(images()), step_of(ball()), **given)
+        error_bars(problem_of(images()), **given)
+
+
+def test_a_misfit_that_cannot_be_made_again_is_refused_before_the_fit():
+    problem = problem_of(images())
+    with pytest.raises(NotImplementedError, match="absolute can't be made of other images"):
+        error_bars(replace(problem, misfit=Absolute(images())))
 
 
 def test_noise_that_cannot_be_measured_must_be_told():

@@ -109,16 +109,20 @@ def calibrate(
     noise: standard deviation of each prism's, in the unit of the data; None is measured in them.
     mask: the pixels that count (True); None is all.
     zernike: Noll indices of the objective's aberrations that are sought too.
-    Raises ValueError where the data's shape isn't the setup's, all images are bright field, or the specimen isn't
-    found.
+    Raises ValueError where the data's shape isn't the setup's, the noise isn't one number for each prism, aberrations
+    are sought of no objective, all images are bright field, or the specimen isn't found.
     """
     if tuple(data.shape) != setup.shape:
         raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {setup.shape}")
+    levels = measured_noise(data, mask) if noise is None else noise
+    if levels is not None and len(levels) != len(data):
+        raise ValueError(f"the noise is given of {len(levels)} prisms, the data have {len(data)}")
+    if zernike and setup.microscope.objective is None:
+        raise ValueError(f"aberrations {list(zernike)} are of an objective, and the microscope has none")
     pixels = setup.pixels
     side = math.ceil((specimen.width + 2 * AROUND) / min(pixels.spacing[1:]))
     part = part_of(data, mask, pixels, side, PLANES)
     model = model_of(part, specimen, number(setup.volume.background), setup.microscope)
-    levels = measured_noise(data, mask) if noise is None else noise
     return find_optics(part, model, setup.acquisition, levels, zernike)
 
 

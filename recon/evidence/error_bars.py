@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+import torch
 from jaxtyping import Bool
 from torch import Tensor
 
@@ -9,7 +10,6 @@ from recon.evidence.bars import ErrorBars, bars_of
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import COPIES, NOISY, planned_refits, refits
 from recon.evidence.regions import INCREMENT
-from recon.fit.descent import solved
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.recording.noise import NoiseModel
@@ -37,15 +37,17 @@ def error_bars(
     increment: of the index with concentration, ml/g, by which dry mass is told.
     outlines: boolean volumes (z, y, x) by name, True within what is drawn around a part; what stands out in it is
     measured as the whole specimen is.
-    Raises ValueError for fewer fits, an outline of another shape, and noise that can't be measured, NotImplementedError
-    for a misfit that can't be made of other images, and what `minimise` raises.
+    Raises, before any fit, ValueError for fewer of them, an outline of another shape, and noise that can't be measured
+    or isn't one number of at least 0 for each prism, and NotImplementedError for a misfit that can't be made of other
+    images; and what `minimise` raises.
     """
     for name, number in (("noisy", noisy), ("copies", copies)):
         if number < 2:
             raise ValueError(f"{name} {number} must be at least 2: one fit tells no spread")
     field = problem.setup.field.shape
     for name, outline in (outlines or {}).items():
-        if tuple(outline.shape) != field:
-            raise ValueError(f"the outline {name!r} has shape {tuple(outline.shape)}, the field {field} (z, y, x)")
-    estimate = Estimate.of_fit(problem, solved(problem) if step is None else step, noise)
+        if tuple(outline.shape) != field or outline.dtype != torch.bool:
+            given = f"{outline.dtype} of shape {tuple(outline.shape)}"
+            raise ValueError(f"the outline {name!r} is {given}, it must be torch.bool of the field's {field} (z, y, x)")
+    estimate = Estimate.of_fit(problem, step, noise)
     return bars_of(estimate, list(refits(estimate, planned_refits(noisy, copies))), increment, outlines)

@@ -1,5 +1,6 @@
 """A volume that was fitted, and how to fit the same again to other images."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,16 +35,20 @@ class Estimate:
     def of_fit(
         cls,
         problem: Problem,
-        step: Step,
+        step: Step | None = None,
         noise: NoiseModel | Sequence[float] | None = None,
         solve: Callable[[Problem], Step] = solved,
     ) -> "Estimate":
         """The estimate that a fit ended with.
 
-        noise: of the images, in the unit of the data: shot and read noise, or the standard deviation of each prism's;
-        None is measured in them. Raises ValueError where it can't be measured, or is of another number of prisms.
+        problem: that was fitted. step: the last; None fits now. noise: of the images, in the unit of the data: shot and
+        read noise, or the standard deviation of each prism's; None is measured in them. solve: solves a problem.
+        Raises, before any fit, ValueError where the noise can't be measured or isn't one number of at least 0 for each
+        prism, and NotImplementedError for a misfit that can't be made of other images.
         """
-        return cls(problem, step, _pixels_noise(problem.misfit, noise), problem.misfit.again, solve)
+        deviation = _pixels_noise(problem.misfit, noise)
+        problem.misfit.again(problem.misfit.data)
+        return cls(problem, solve(problem) if step is None else step, deviation, problem.misfit.again, solve)
 
     @property
     def delta(self) -> Float[Tensor, "z y x"]:
@@ -91,6 +96,9 @@ def _pixels_noise(misfit: Misfit, told: NoiseModel | Sequence[float] | None) -> 
         return lambda images: told.like(images).variance(images).sqrt()
     if len(told) != len(misfit.data):
         raise ValueError(f"the noise is given of {len(told)} prisms, the data have {len(misfit.data)}")
+    for prism, level in enumerate(told):
+        if not 0 <= level < math.inf:
+            raise ValueError(f"the noise {level:g} of prism {prism + 1} must be at least 0 and finite")
     levels = torch.tensor(told)[:, None, None, None]
     return lambda images: levels.to(images)
 
