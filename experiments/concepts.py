@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from data_synthetic import Bead, CellPhantom, GaussianBall
+from recon import exact_images
 from recon.report.terminal import write_plainly
-from recon.run.exact_images import exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.linear import transfer_function
 

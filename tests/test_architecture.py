@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import recon
 import torchdic
 from torchdic.propagation.base import propagations
 
@@ -159,9 +160,16 @@ def test_imports_point_down(package, order):
     assert offenders((path for path in modules(package) if room(path) != "__init__"), upward) == {}
 
 
-def test_a_file_names_the_room_that_it_uses():
-    inside = [path for path in modules("torchdic") if room(path) != "__init__"]
-    assert offenders(inside, lambda path: {"torchdic"} & imported(path)) == {}
+@pytest.mark.parametrize("package", ["torchdic", "recon"])
+def test_a_file_names_the_room_that_it_uses(package):
+    inside = [path for path in modules(package) if room(path) != "__init__"]
+    assert offenders(inside, lambda path: {package} & imported(path)) == {}
+
+
+def test_public_names_of_the_inverse_come_from_below_its_command_line():
+    """Which alone sees the truth."""
+    assert rooms_imported(ROOT / "recon/__init__.py", "recon") & {"cli", "__main__"} == set()
+    assert not any(name.startswith("cli.") for name in recon._FILES)
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -299,6 +307,7 @@ def test_rooms_hand_nothing_on():
     }
     assert faces == {
         "torchdic/__init__.py",
+        "recon/__init__.py",
         "data_synthetic/__init__.py",
         "recon/config/__init__.py",
         "recon/cli/__init__.py",

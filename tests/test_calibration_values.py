@@ -1,6 +1,7 @@
 """Values of a calibration: from levels, from a known specimen and from trials; each within its uncertainty."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import recon.calibration.known_specimen as known
 from data_synthetic import Bead
 from recon.calibration.beside_volume import Beside, find_angles, find_images, find_length
 from recon.calibration.foreknowledge import Foreknowledge, most_probable
-from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
+from recon.calibration.known_specimen import ModelledSpecimen, calibrate
 from recon.calibration.length_and_bias import Shared, shared
 from recon.calibration.levels import biases_of_levels
 from recon.calibration.optics import (
@@ -26,7 +27,7 @@ from recon.calibration.trials.profile import FREEDOM, least_misfit
 from recon.fit.bounds import Bounds
 from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Recipe
-from recon.fit.setup import Setup
+from recon.fit.setup import Setup, empty_medium
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 from torchdic.errors import SamplingWarning
@@ -209,10 +210,12 @@ def optics_of_bead(seed, rounds, monkeypatch, biases=(75.0, -75.0)):
     with torch.no_grad():
         data = bead_images(true, 20000.0, seed, place, (32, 30))
     told = Acquisition([Prism((0.04, 0.19), rad(b + math.copysign(6, b))) for b in biases], true.focus)
-    part = part_of(data, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
-    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
-    model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
-    return find_optics(part, model, told, [0.005] * len(biases)), true
+    return calibrate(data, told_setup(told, data), ModelledSpecimen(bead.delta, 2.4, 2.4)), true
+
+
+def told_setup(acquisition, data):
+    medium = empty_medium(Grid((8, 32, 30), (0.5, 0.2, 0.2)), 1.4, data)
+    return Setup(medium, Microscope(0.546, Objective(0.8), Condenser(0.45)), acquisition)
 
 
 @pytest.mark.slow
@@ -246,14 +249,45 @@ def test_errors_of_a_bead_are_within_three_deviations(monkeypatch, seed):
     assert abs(math.log(length)) < min(3 * float(found.deviations["shear"][0, 0]), 0.05)
 
 
-def test_a_specimen_that_is_not_there_is_told():
+def test_what_a_calibration_cannot_be_of_is_told():
     bead = Bead(1.2, 0.06, 1.4)
     noise = 1 + 0.01 * torch.randn(1, 2, 32, 30, generator=torch.Generator().manual_seed(0))
-    part = part_of(noise, None, Grid((8, 32, 30), (0.5, 0.2, 0.2)))
-    specimen = ModelledSpecimen(lambda grid: bead.delta(grid, dtype=torch.float32), 2.4, 2.4)
-    model = model_of(part, specimen, 1.4, Microscope(0.546, Objective(0.8), Condenser(0.45)))
+    told = told_setup(Acquisition([Prism((0.0, 0.2), 1.4)], (0.0, 1.0)), noise)
     with pytest.raises(ValueError, match="the specimen isn't in the images"):
-        find_optics(part, model, Acquisition([Prism((0.0, 0.2), 1.4)], (0.0, 1.0)), [0.01])
+        calibrate(noise, told, ModelledSpecimen(bead.delta, 2.4, 2.4))
+    with pytest.raises(ValueError, match=r"shape \(1, 1, 32, 30\), the acquisition and grid ask for \(1, 2, 32, 30\)"):
+        calibrate(noise[:, :1], told, ModelledSpecimen(bead.delta, 2.4, 2.4))
+    with pytest.raises(ValueError, match="the noise is given of 2 prisms, the data have 1"):
+        calibrate(noise, told, ModelledSpecimen(bead.delta, 2.4, 2.4), [0.01, 0.01])
+    bare = replace(told, microscope=Microscope(0.546))
+    with pytest.raises(ValueError, match=r"aberrations \[11\] are of an objective, and the microscope has none"):
+        calibrate(noise, bare, ModelledSpecimen(bead.delta, 2.4, 2.4), zernike=[11])
+
+
+def test_a_calibration_takes_seven_planes_and_some_light_around_the_bead(monkeypatch):
+    """And the noise that the images show."""
+
+    class TakenError(Exception):
+        pass
+
+    def taken(*given):
+        raise TakenError(*given)
+
+    monkeypatch.setattr(known, "find_optics", taken)
+    data = 1 + 0.01 * torch.randn(1, 9, 70, 70, generator=torch.Generator().manual_seed(0))
+    told = Acquisition([Prism((0.0, 0.2), 1.4)], [0.5 * plane for plane in range(9)])
+    medium = empty_medium(Grid((8, 70, 70), (0.5, 0.2, 0.2)), 1.4, data)
+    mask = torch.ones_like(data, dtype=torch.bool)
+    specimen = ModelledSpecimen(Bead(1.2, 0.06, 1.4).delta, 2.4, 2.4)
+    with pytest.raises(TakenError) as found:
+        calibrate(data, Setup(medium, Microscope(0.546, Objective(0.8)), told), specimen, mask=mask, zernike=(11,))
+    part, model, acquisition, noise, zernike = found.value.args
+    assert part.planes == (0, 1, 3, 4, 5, 7, 8)
+    assert part.data.shape == part.mask.shape == (1, 7, 47, 47)  # 2.4 µm and 3.5 µm on each side, of 0.2 µm
+    assert model.volume.grid.shape == (12, 67, 67)  # of 0.2 µm; a fifth wider on each side
+    assert acquisition is told
+    assert noise == pytest.approx([0.01], rel=0.05)
+    assert zernike == (11,)
 
 
 # --- beside an unknown volume -----------------------------------------------------------------------------------------

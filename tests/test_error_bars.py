@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from absolute import Absolute
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from small_bead import CONFIG
 
 from recon.cli import main
 from recon.evidence.bars import SPECIMEN, bars_of
+from recon.evidence.error_bars import error_bars
 from recon.evidence.errors import ErrorModel, near, noise_deviation, noise_interval
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import Refit, planned_refits, refits
@@ -24,6 +26,8 @@ from recon.fit.problem import Problem, Recipe
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
+from recon.recording.noise import NoiseModel
+from recon.run.reconstruct import reconstructed
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 from torchdic.files.stack import read_volume
 
@@ -315,6 +319,59 @@ def test_bars_of_an_empty_volume_are_nothing():
     assert all(known.value == known.error == 0.0 for known in found.regions[SPECIMEN][1].values())
 
 
+# in Python
+
+
+def test_a_problem_alone_is_fitted_and_has_its_bars():
+    """With the noise that its images show, and the numbers of the parts that are drawn."""
+    problem = problem_of(images(), Recipe(steps=1))
+    half = torch.zeros(GRID.shape, dtype=torch.bool)
+    half[:, :12] = True
+    found = error_bars(problem, noisy=2, copies=2, increment=0.2, outlines={"half": half})
+    assert found.delta.shape == found.deviation.shape == found.total.shape == GRID.shape
+    assert set(found.regions) == {SPECIMEN, "half"}
+    assert bool((found.total >= found.deviation).all())
+    assert float(found.deviation.max()) > 0
+
+
+def test_the_noise_of_each_pixel_is_the_cameras_or_its_prisms():
+    problem, bright = problem_of(images()), torch.full((1, 2, 24, 20), 0.5)
+    by_camera = Estimate.of_fit(problem, step_of(ball()), NoiseModel(0.02, 0.1)).noise(bright)
+    assert by_camera.flatten().tolist() == pytest.approx([math.sqrt(0.02 * 0.5 + 0.1**2)] * bright.numel())
+    by_prism = Estimate.of_fit(problem, step_of(ball()), [0.03]).noise(bright)
+    assert by_prism.flatten().tolist() == pytest.approx([0.03])
+    measured = Estimate.of_fit(problem, step_of(ball())).noise(bright)
+    assert measured.flatten().tolist() == pytest.approx([0.1 / math.sqrt(12)], rel=0.2)  # of numbers from 0 to 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"noisy": 1}, "noisy 1 must be at least 2"),
+        ({"copies": 0}, "copies 0 must be at least 2"),
+        ({"noise": [0.1, 0.1]}, "the noise is given of 2 prisms, the data have 1"),
+        ({"noise": [-0.1]}, "the noise -0.1 of prism 1 must be at least 0 and finite"),
+        ({"outlines": {"half": torch.ones(2, 3, 4) > 0}}, r"'half' is torch.bool of shape \(2, 3, 4\), it must be"),
+    ],
+)
+def test_what_error_bars_cannot_be_of_is_refused(given, line):
+    with pytest.raises(ValueError, match=line):
+        error_bars(problem_of(images()), **given)
+
+
+def test_a_misfit_that_cannot_be_made_again_is_refused_before_the_fit():
+    problem = problem_of(images())
+    with pytest.raises(NotImplementedError, match="absolute can't be made of other images"):
+        error_bars(replace(problem, misfit=Absolute(images())))
+
+
+def test_noise_that_cannot_be_measured_must_be_told():
+    grid = Grid((2, 2, 2), (0.4, 0.2, 0.2))
+    problem = problem_of(images()[..., :2, :2], grid=grid)
+    with pytest.raises(ValueError, match="the noise of images so small can't be measured"):
+        error_bars(problem, step_of(torch.zeros(grid.shape)))
+
+
 # the command
 
 
@@ -357,6 +414,15 @@ def test_it_leaves_volumes_a_figure_and_numbers(done):
     assert 0 < told["seen_share"] < 1
     assert (done / "error_bars.png").stat().st_size > 0
     assert len(list((done / "refits").glob("*.npy"))) == 6
+
+
+@pytest.mark.filterwarnings("ignore::torchdic.errors.SamplingWarning")
+def test_python_finds_the_same_bars_of_the_same_fit(done):
+    """Bit for bit: the noise is measured alike, and each refit depends on its number alone."""
+    read = reconstructed(done, torch.device("cpu"))
+    found = error_bars(read.problem, read.step, noisy=3, copies=2)
+    for name, bar in (("sd.ome.tif", found.deviation), ("error.ome.tif", found.total)):
+        assert torch.equal(bar, read_volume(done / name)[0])
 
 
 @pytest.mark.filterwarnings("always::recon.report.verdict.PoorFitWarning")

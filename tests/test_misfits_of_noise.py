@@ -56,6 +56,32 @@ def some_mask(shape):
     return mask
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_misfit_of_other_images_is_as_if_made_of_them(make, masked):
+    """With its own noise, mask and scale. One of measured noise keeps it: the other images are of the same camera."""
+    truth = specimen((2, 3, 12, 14))
+    mask = some_mask(truth.shape) if masked else None
+    first, other = (recorded(truth, 0.02, 0.01, seed) for seed in (0, 1))
+    misfit = make(first, mask)
+    if isinstance(misfit, Absolute):
+        with pytest.raises(NotImplementedError, match=r"of the kind absolute can't be made of other images"):
+            misfit.again(other)
+        return
+    again = misfit.again(other)
+    made = RobustMisfit(other, misfit.noise, mask) if isinstance(misfit, RobustMisfit) else make(other, mask)
+    assert type(again) is type(misfit)
+    assert float(again(truth)) == float(made(truth)) != float(misfit(truth))
+    assert torch.equal(again.curvature(truth), made.curvature(truth))
+
+
+def test_a_misfit_of_ones_own_that_builds_on_another_is_made_again_like_it():
+    class Own(GaussianMisfit):
+        name = "own"
+
+    data = specimen((2, 3, 8, 10))
+    assert type(Own(data, NOISE).again(2 * data)) is Own
+
+
 def brightness(misfit, truth):
     """The factor of the true images that makes the misfit least, by bisection of its slope."""
     low, high = 0.1, 10.0

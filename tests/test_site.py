@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import data_synthetic
+import recon
 import torchdic
-from recon import descend
 from recon.cli.commands import COMMANDS
 from recon.config.conversion import FIELDS, flat
 from recon.config.reading import load
@@ -72,9 +72,9 @@ def test_every_command_and_option_is_in_the_reference():
 
 def test_every_public_name_is_in_the_reference():
     page = names.page()
-    for module in (torchdic, descend, data_synthetic):
-        for name in module.__all__:
-            assert re.search(rf"^\.\. auto\w+:: {module.__name__}\.{name}$", page, re.MULTILINE)
+    for package in (torchdic, recon, data_synthetic):
+        for name in package.__all__:
+            assert re.search(rf"^\.\. auto\w+:: {package.__name__}\.{name}$", page, re.MULTILINE)
 
 
 def test_a_docstring_is_read_in_its_parts():

@@ -3,32 +3,31 @@
 import inspect
 from importlib import import_module
 
-# The packages and modules whose `__all__` is public, and what each is.
-MODULES = {
+# The packages whose `__all__` is public, and what each is.
+PACKAGES = {
     "torchdic": "the microscope",
-    "recon.descend": "the fit of a volume, step by step",
+    "recon": "the inverse",
     "data_synthetic": "specimens with a known answer",
 }
 
 
 def page() -> str:
     """The page of the reference, in Markdown around autodoc's directives."""
-    return "# Every public name\n\nMade from the docstrings.\n\n" + "\n".join(map(_module, MODULES))
+    return "# Every public name\n\nMade from the docstrings.\n\n" + "\n".join(map(_package, PACKAGES))
 
 
-def _module(module: str) -> str:
-    lines = [f"## {module}: {MODULES[module]}", ""]
-    described = inspect.getdoc(import_module(module)) and module != "recon.descend"
-    lines += ["```{eval-rst}", f".. automodule:: {module}", "   :no-members:", "```", ""] if described else []
-    for name in import_module(module).__all__:
-        lines += ["```{eval-rst}", f".. {_directive(module, name)}", "```", ""]
+def _package(package: str) -> str:
+    lines = [f"## {package}: {PACKAGES[package]}", ""]
+    lines += ["```{eval-rst}", f".. automodule:: {package}", "   :no-members:", "```", ""]
+    for name in import_module(package).__all__:
+        lines += ["```{eval-rst}", f".. {_directive(package, name)}", "```", ""]
     return "\n".join(lines)
 
 
-def _directive(module: str, name: str) -> str:
-    value = getattr(import_module(module), name)
+def _directive(package: str, name: str) -> str:
+    value = getattr(import_module(package), name)
     if inspect.isclass(value):
-        return f"autoclass:: {module}.{name}\n   :members:"
+        return f"autoclass:: {package}.{name}\n   :members:"
     if callable(value):
-        return f"autofunction:: {module}.{name}"
-    return f"autodata:: {module}.{name}\n   :no-value:"
+        return f"autofunction:: {package}.{name}"
+    return f"autodata:: {package}.{name}\n   :no-value:"

@@ -13,9 +13,7 @@ import matplotlib.pyplot as plt
 import tifffile
 import torch
 
-from recon.earlier.one_image import phase_of_image
-from recon.recording.background import background_surface, noise_level
-from recon.recording.shear_axis import estimate_shear_axis
+from recon import background_surface, estimate_shear_axis, noise_level, phase_of_image
 
 if "TORCHDIC_DATA" not in os.environ:
     raise SystemExit("agar_beads.py: TORCHDIC_DATA must name the folder that holds dic_agar_beads.tiff")

@@ -10,9 +10,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Bead
-from recon.calibration.known_specimen import ModelledSpecimen, find_optics, model_of
-from recon.calibration.part import part_of
-from recon.run.exact_images import exact_images
+from recon import ModelledSpecimen, Setup, calibrate, empty_medium, exact_images
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 
 grid, bead, focus = Grid((10, 36, 36), (0.3, 0.17, 0.17)), Bead(1.5, 0.06, 1.52), [-2.0, 0.0, 2.0]
@@ -20,10 +18,8 @@ true = Acquisition([Prism((0.0, 0.22), bias) for bias in (1.4, -1.4)], focus)
 told = Acquisition([Prism((0.0, 0.25), bias) for bias in (1.6, -1.6)], focus)
 noiseless = exact_images(bead, grid, Microscope(0.546, Objective(0.9), Condenser(0.7)), true, Fidelity(sources=128))
 data = Camera(photons=5000).record(noiseless.float(), torch.Generator().manual_seed(0))
-part = part_of(data, None, grid)
-specimen = ModelledSpecimen(lambda voxels: bead.delta(voxels, dtype=torch.float32), height=3.0, width=3.0)
-model = model_of(part, specimen, bead.background, Microscope(0.546, Objective(0.9), Condenser(0.6)))
-found = find_optics(part, model, told, noise=[0.01, 0.01])
+setup = Setup(empty_medium(grid, 1.52, data), Microscope(0.546, Objective(0.9), Condenser(0.6)), told)
+found = calibrate(data, setup, ModelledSpecimen(bead.delta, height=3.0, width=3.0))
 
 names, wrong = ["bias", "shear's length", "condenser's NA"], [1.6 / 1.4, 0.25 / 0.22, 0.6 / 0.7]
 value, sure = found.values, found.deviations  # of length and NA: factors, and deviations of their logarithms

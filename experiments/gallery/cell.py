@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import CellPhantom
-from recon.descend import Recipe, descend
+from recon import Recipe, descend
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 cell, lenses = CellPhantom(), (0.546, Objective(0.9), Condenser(0.7))

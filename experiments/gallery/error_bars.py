@@ -10,13 +10,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Ellipsoid
-from recon.descend import Problem, Recipe
-from recon.evidence.bars import bars_of
-from recon.evidence.estimate import Estimate
-from recon.evidence.refits import planned_refits, refits
-from recon.fit.descent import solved
-from recon.fit.setup import Setup, empty_medium
-from recon.misfit.gaussian import GaussianMisfit
+from recon import NoiseModel, Problem, Recipe, Setup, empty_medium, error_bars
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 grid, photons = Grid((14, 40, 40), (0.4, 0.17, 0.17)), 2000
@@ -26,8 +20,7 @@ scene = Microscope(0.546, Objective(0.9), Condenser(0.7)), Acquisition(prisms, [
 noiseless = image(Volume(grid, truth, 1.335), *scene, Fidelity(sources=128))
 data = Camera(photons=photons).record(noiseless, torch.Generator().manual_seed(0))
 problem = Problem.from_recipe(data, Setup(empty_medium(grid, 1.335, data), *scene), Fidelity(sources=50), Recipe())
-estimate = Estimate(problem, solved(problem), lambda images: (images / photons).sqrt(), GaussianMisfit, solved)
-bars = bars_of(estimate, list(refits(estimate, planned_refits(noise=8, copies=4))), increment=0.185)
+bars = error_bars(problem, noise=NoiseModel(gain=1 / photons, read=0.0), noisy=8, copies=4)
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained", sharey=True)
 for axis, at, name, line in ((axes[0], 2, "x", (7, 21)), (axes[1], 0, "z", (slice(None), 21, 19))):

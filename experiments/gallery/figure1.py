@@ -12,13 +12,13 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Bead
-from recon.run.exact_images import WIDENING, exact_images
+from recon import exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 grid, bead = Grid((100, 100, 100), (0.1, 0.17, 0.17)), Bead(radius=5.0, contrast=0.03, background=1.56)
 microscope, focus = Microscope(0.546, Objective(0.9), Condenser(0.7)), [0.0, 4.0, 8.0]
 acquisition = Acquisition([Prism((0.0, 0.24), math.pi / 2)], focus)
-fidelity = Fidelity("wave", sources=72, padding=round(WIDENING * grid.shape[1]))  # as wide as the exact field
+fidelity = Fidelity("wave", sources=72, padding=grid.shape[1] // 2)  # as wide as the exact field
 volume = Volume(grid, bead.delta(grid, dtype=torch.float32), bead.background)
 wave = image(volume, microscope, acquisition, fidelity)[0]
 exact = exact_images(bead, grid, microscope, acquisition, fidelity)[0]

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from recon.descend import Recipe, descend
+from recon import Recipe, descend
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 if "TORCHDIC_DATA" not in os.environ:

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Bead
-from recon.run.exact_images import exact_images
+from recon import exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 grid = Grid(shape=(24, 56, 56), spacing=(0.15, 0.15, 0.15))

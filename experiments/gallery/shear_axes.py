@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Ellipsoid
-from recon.descend import Recipe, descend
+from recon import Recipe, descend
 from torchdic import Acquisition, Camera, Condenser, Fidelity, Grid, Microscope, Objective, Prism, Volume, image
 
 grid, focus = Grid((12, 72, 72), (0.4, 0.17, 0.17)), [-0.5, 0.5]

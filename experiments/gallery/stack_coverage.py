@@ -11,8 +11,7 @@ import math
 import matplotlib.pyplot as plt
 import torch
 
-from recon.coverage.acquisition import NoisyAcquisition, shot_noise
-from recon.coverage.expected import ExpectedSpecimen
+from recon import ExpectedSpecimen, NoisyAcquisition, shot_noise
 from torchdic import Acquisition, Condenser, Grid, Microscope, Objective, Prism
 
 grid, microscope = Grid((24, 48, 48), (0.35, 0.17, 0.17)), Microscope(0.546, Objective(0.9), Condenser(0.7))

@@ -12,8 +12,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from data_synthetic import Bead
-from recon.descend import Recipe, descend
-from recon.run.exact_images import exact_images
+from recon import Recipe, descend, exact_images
 from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objective, Prism
 
 grid, bead = Grid((16, 40, 40), (0.35, 0.17, 0.17)), Bead(radius=1.8, contrast=0.03, background=1.56)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from tqdm import tqdm
 
@@ -21,7 +21,7 @@ from recon.calibration.optics import (
     ShearOfAxes,
     axes_of,
 )
-from recon.calibration.part import Part
+from recon.calibration.part import Part, part_of
 from recon.calibration.trials.short_fits import unwarned
 from recon.calibration.uncertainty import standard_deviations
 from recon.fit.nuisances.base import Nuisance
@@ -29,12 +29,16 @@ from recon.fit.nuisances.bias import Bias
 from recon.fit.nuisances.light import Brightness, Lamp
 from recon.fit.nuisances.nearby import Nearby, formed_together
 from recon.fit.nuisances.refinement import SCALE, refined
+from recon.fit.problem import measured_noise
 from recon.fit.setup import Setup
 from recon.fit.unknowns import with_values
 from recon.misfit.base import Misfit
 from recon.misfit.gaussian import GaussianMisfit
 from torchdic import Acquisition, Camera, Fidelity, Grid, Microscope, Volume
 from torchdic.scalar import number
+
+# Planes of the stack, and µm of light around the specimen on each side, that its fit takes.
+PLANES, AROUND = 7, 3.5
 
 # Thickness of a slab in µm, and the part of the field's width by which the model's is wider on each side.
 SLAB, MARGIN = 0.2, 0.2
@@ -55,7 +59,8 @@ SURE = 6.0
 class ModelledSpecimen:
     """A specimen of known shape and index.
 
-    delta: its Δn (z, y, x) on a grid about whose centre it lies. height, width: along z and across it, µm.
+    delta: gives its Δn (z, y, x) on a grid about whose centre it lies, as `delta` of a `data_synthetic.Bead` does.
+    height, width: along z and across it, µm.
     """
 
     delta: Callable[[Grid], Tensor]
@@ -67,17 +72,58 @@ class ModelledSpecimen:
 class OpticsFound:
     """What a known specimen tells.
 
-    values: by the unknown's name. parameters, deviations: their parameters, and one standard deviation of these: by the
-    images (`recon.calibration.uncertainty`), and how far they moved with the last condenser directions.
-    setup: with all values in it. misfit: of its images. noise: what noise leaves of it; None where that isn't known.
+    values: by name. "bias" (prism,) is in rad; "shear" (axis, 2) is the factor on the told length and the angle in rad
+    by which it is turned from +x towards +y; "condenser" is the factor on the told NA; "focus_zero", µm, is to be added
+    to the planes; "drift" (prism, focus, 2), µm (y, x), is where the specimen is in each image; "brightness" is (prism,
+    focus) and "lamp" (prism, 5), see `Setup`; "aberrations" (term,), rad, are to be added to those told.
+    parameters, deviations: of each value its parameter, which is the logarithm of what is a factor and the value itself
+    else, and one standard deviation of that, by the images (`recon.calibration.uncertainty`) and by how far it moved
+    with the last condenser directions.
+    planes: which of the stack's were taken, from 0. setup: the model of these, with all values in it.
+    misfit: of its images. noise: what noise leaves of it; None where that isn't known.
     """
 
     values: dict[str, Tensor]
     parameters: dict[str, Tensor]
     deviations: dict[str, Tensor]
+    planes: tuple[int, ...]
     setup: Setup
     misfit: float
     noise: float | None
+
+
+def calibrate(
+    data: Float[Tensor, "prism focus y x"],
+    setup: Setup,
+    specimen: ModelledSpecimen,
+    noise: Sequence[float] | None = None,
+    mask: Bool[Tensor, "prism focus y x"] | None = None,
+    zernike: Sequence[int] = (),
+) -> OpticsFound:
+    """Find the optics behind a stack of a known specimen, such as a bead, each with its uncertainty.
+
+    Bias, length and direction of the shear, the condenser's aperture, and the place and brightness of each image.
+
+    data: (prism, focus, y, x), relative to the empty bright field. setup: what is told, the signs and the prisms' order
+    right; its volume's Δn plays no part. specimen: behind the images, anywhere.
+    noise: standard deviation of each prism's, in the unit of the data; None is measured in them.
+    mask: the pixels that count (True); None is all.
+    zernike: Noll indices of the objective's aberrations that are sought too.
+    Raises ValueError where the data's shape isn't the setup's, the noise isn't one number for each prism, aberrations
+    are sought of no objective, all images are bright field, or the specimen isn't found.
+    """
+    if tuple(data.shape) != setup.shape:
+        raise ValueError(f"the data have shape {tuple(data.shape)}, the acquisition and grid ask for {setup.shape}")
+    levels = measured_noise(data, mask) if noise is None else noise
+    if levels is not None and len(levels) != len(data):
+        raise ValueError(f"the noise is given of {len(levels)} prisms, the data have {len(data)}")
+    if zernike and setup.microscope.objective is None:
+        raise ValueError(f"aberrations {list(zernike)} are of an objective, and the microscope has none")
+    pixels = setup.pixels
+    side = math.ceil((specimen.width + 2 * AROUND) / min(pixels.spacing[1:]))
+    part = part_of(data, mask, pixels, side, PLANES)
+    model = model_of(part, specimen, number(setup.volume.background), setup.microscope)
+    return find_optics(part, model, setup.acquisition, levels, zernike)
 
 
 def model_of(part: Part, specimen: ModelledSpecimen, background: float, microscope: Microscope) -> Setup:
@@ -133,6 +179,7 @@ def find_optics(
         values,
         parameters,
         deviations,
+        part.planes,
         with_values(unknowns, values, setup),
         float(misfit(nearby.recorded(parameters))),
         misfit.of_noise(noise),

@@ -1,6 +1,7 @@
 """A volume that was fitted, and how to fit the same again to other images."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,10 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.fit.bounds import Bounds
-from recon.fit.problem import Problem
+from recon.fit.descent import solved
+from recon.fit.problem import Problem, measured_noise
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknown, with_values
 from recon.misfit.base import Misfit, UniformImagesError
+from recon.recording.noise import NoiseModel, noise_of_level
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,25 @@ class Estimate:
     noise: Callable[[Tensor], Tensor]
     misfit: Callable[[Tensor], Misfit]
     solve: Callable[[Problem], Step]
+
+    @classmethod
+    def of_fit(
+        cls,
+        problem: Problem,
+        step: Step | None = None,
+        noise: NoiseModel | Sequence[float] | None = None,
+        solve: Callable[[Problem], Step] = solved,
+    ) -> "Estimate":
+        """The estimate that a fit ended with.
+
+        problem: that was fitted. step: the last; None fits now. noise: of the images, in the unit of the data: shot and
+        read noise, or the standard deviation of each prism's; None is measured in them. solve: solves a problem.
+        Raises, before any fit, ValueError where the noise can't be measured or isn't one number of at least 0 for each
+        prism, and NotImplementedError for a misfit that can't be made of other images.
+        """
+        deviation = _pixels_noise(problem.misfit, noise)
+        problem.misfit.again(problem.misfit.data)
+        return cls(problem, solve(problem) if step is None else step, deviation, problem.misfit.again, solve)
 
     @property
     def delta(self) -> Float[Tensor, "z y x"]:
@@ -61,6 +83,24 @@ class Estimate:
         newton = self.problem.method == "newton"  # what Adam ends with depends on the number of its steps
         problem = self.problem.again(misfit, self.step, self.delta if going_on and newton else None)
         return self.solve(_unsupported(problem) if anywhere else problem).delta
+
+
+def _pixels_noise(misfit: Misfit, told: NoiseModel | Sequence[float] | None) -> Callable[[Tensor], Tensor]:
+    """The standard deviation of the noise at each pixel of given images. told: as in `Estimate.of_fit`."""
+    if told is None:
+        mask = None if misfit.mask is None else misfit.mask.cpu().numpy()
+        told = noise_of_level(misfit.data.cpu().numpy(), mask) or measured_noise(misfit.data, misfit.mask)
+    if told is None:
+        raise ValueError("the noise of images so small can't be measured: there are no error bars without")
+    if isinstance(told, NoiseModel):
+        return lambda images: told.like(images).variance(images).sqrt()
+    if len(told) != len(misfit.data):
+        raise ValueError(f"the noise is given of {len(told)} prisms, the data have {len(misfit.data)}")
+    for prism, level in enumerate(told):
+        if not 0 <= level < math.inf:
+            raise ValueError(f"the noise {level:g} of prism {prism + 1} must be at least 0 and finite")
+    levels = torch.tensor(told)[:, None, None, None]
+    return lambda images: levels.to(images)
 
 
 def _unsupported(problem: Problem) -> Problem:

@@ -16,6 +16,7 @@ from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
+from tqdm import tqdm
 
 from recon.evidence.estimate import Estimate
 from recon.evidence.turned import middle, turn, turned
@@ -23,6 +24,9 @@ from recon.evidence.turned import middle, turn, turned
 # What a refit is of, and with its number from 0, which one it is.
 Kind = Literal["noiseless", "noise", "turned"]
 Named = tuple[Kind, int]
+
+# How many there are unless the user says otherwise.
+NOISY, COPIES = 16, 8
 
 # Seeds of the noise: those of the copies begin here.
 SEEDS_OF_COPIES = 1000
@@ -53,10 +57,13 @@ def planned_refits(noise: int, copies: int) -> list[Named]:
 
 
 def refits(estimate: Estimate, wanted: list[Named]) -> Iterator[Refit]:
-    """The refits that are wanted, one by one as they are done. Each depends on its kind and number alone."""
+    """The refits that are wanted, one by one as they are done, beside a bar that says so.
+
+    Each depends on its kind and number alone.
+    """
     setup = estimate.problem.setup
     own = estimate.images(estimate.delta) if any(kind != "turned" for kind, _ in wanted) else None
-    for kind, number in wanted:
+    for kind, number in tqdm(wanted, desc="refits", unit="fit"):
         if kind == "turned":
             truth = copy(estimate, number)
             images = estimate.recorded(estimate.images(truth), SEEDS_OF_COPIES + number)

@@ -46,13 +46,17 @@ def descend(
 
 
 def solved(problem: Problem) -> Step:
-    """The last step of a problem's descent; earlier ones aren't held. Raises as `minimise` does."""
+    """The last step of a problem's descent; earlier ones aren't held.
+
+    problem: as `Problem.from_recipe` makes it. Raises as `minimise` does.
+    """
     return deque(minimise(problem), maxlen=1).pop()
 
 
 def minimise(problem: Problem, resume: Step | None = None) -> Iterator[Step]:
     """Lower the misfit and the priors of a problem by its method; yields every step.
 
+    problem: as `Problem.from_recipe` makes it, or with parts of one's own.
     resume: the step to go on from; the rest is as if there had been no interruption.
     Where a GPU's memory runs out, the step is taken again with batches of half the sources, and the later ones too;
     ShortageWarning says so.

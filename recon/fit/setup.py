@@ -18,6 +18,7 @@ TERMS = 5
 class Setup:
     """The specimen, the microscope and the acquisition, as far as they are known, and what the recording did to them.
 
+    volume: Δn, or an empty one where it is sought, see `empty_medium`. microscope, acquisition: as in `torchdic.image`.
     brightness: of each image (prism, focus), relative to what the model expects; None is 1.
     drift: of each image (prism, focus, 2), µm (y, x): a positive one moves the specimen's picture towards +y and +x.
     None is no drift.
@@ -141,7 +142,10 @@ def _surfaces(images: Tensor) -> Float[Tensor, "term y x"]:
 
 
 def empty_medium(grid: Grid, background: float, like: Tensor) -> Volume:
-    """A volume of Δn = 0 that takes no memory. background: the medium's index. like: gives the dtype and device."""
+    """A volume of Δn = 0 that takes no memory.
+
+    grid: its voxels. background: the medium's index. like: gives the dtype and device, as the data do; of any shape.
+    """
     return Volume(grid, like.new_zeros(()).expand(grid.shape), background)
 
 

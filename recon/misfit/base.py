@@ -108,6 +108,15 @@ class Misfit(ABC):
         """
         raise NotImplementedError(f"a misfit of the kind {self.name} can't be cut into tiles")
 
+    def again(self, data: Float[Tensor, "prism focus y x"]) -> "Misfit":
+        """The misfit of other images of the same scene: with this one's noise and mask, and their own scale.
+
+        What fits again to other images, as error bars do, needs it. A subclass whose constructor takes something else
+        than that of the class on which it builds has its own. Raises ValueError as any misfit does, NotImplementedError
+        for a kind that has none.
+        """
+        raise NotImplementedError(f"a misfit of the kind {self.name} can't be made of other images: it has no again()")
+
     def _mask_of_part(self, rows: slice, columns: slice) -> Bool[Tensor, "prism focus y x"] | None:
         """The mask of a part of the images."""
         return None if self.mask is None else self.mask[..., rows, columns]

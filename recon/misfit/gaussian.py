@@ -48,6 +48,10 @@ class GaussianMisfit(Misfit):
         scatter = model.gain.square() * model.variance(level) / number.clamp_min(1)
         self._noise_alone = self.mean(model.variance(level) / variance + scatter / variance.square())
 
+    def again(self, data: Float[Tensor, "prism focus y x"]) -> "GaussianMisfit":
+        """The misfit of other images, see `Misfit.again`."""
+        return type(self)(data, self.noise, self.mask)
+
     def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "GaussianMisfit":
         """The misfit of a part of the images, see `Misfit.part`."""
         noise = None if self.noise is None else self.noise.part(rows, columns)

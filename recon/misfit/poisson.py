@@ -49,6 +49,10 @@ class PoissonMisfit(Misfit):
             uniform = image_means(self.data, self.mask).expand_as(self.data)
             self._empty = self.mean(deviance(self._counts, self._photons(uniform), self._darkest))
 
+    def again(self, data: Float[Tensor, "prism focus y x"]) -> "PoissonMisfit":
+        """The misfit of other images, see `Misfit.again`."""
+        return type(self)(data, self.noise, self.mask)
+
     def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "PoissonMisfit":
         """The misfit of a part of the images, see `Misfit.part`."""
         noise = self.noise.part(rows, columns)

@@ -58,6 +58,10 @@ class RobustMisfit(Misfit):
         uniform = medians.nan_to_num(0).reshape(*self.data.shape[:2], 1, 1)  # an image without pixels has no median
         self._empty = self.mean(huber((self.data - uniform) / self._scale))
 
+    def again(self, data: Float[Tensor, "prism focus y x"]) -> "RobustMisfit":
+        """The misfit of other images, see `Misfit.again`."""
+        return type(self)(data, self.noise, self.mask)
+
     def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "RobustMisfit":
         """The misfit of a part of the images, see `Misfit.part`."""
         return RobustMisfit(self.data[..., rows, columns], self.noise, self._mask_of_part(rows, columns), unit)

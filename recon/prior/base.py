@@ -19,7 +19,8 @@ from torchdic import Volume
 class Majorant:
     """Mean over the voxels of edges·|∇Δn| + sparse·|Δn| + rough·½|∇Δn|²; ∇ is that of `recon.prior.edges`.
 
-    edges: one weight, one per voxel (z, y, x), or one per corner of each (corner, z, y, x).
+    edges: one weight, one per voxel (z, y, x), or one per corner of each (corner, z, y, x). sparse, rough: one weight
+    each, at least 0 as all are.
     """
 
     edges: Tensor | float = 0.0

@@ -24,7 +24,10 @@ CORNERS = ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 0))
 def gradient_length(
     delta: Float[Tensor, "z y x"], spacing: tuple[float, float, float]
 ) -> Float[Tensor, "corner z y x"]:
-    """|∇Δn| at each of the CORNERS times the spacing along x, at least SMOOTHING."""
+    """|∇Δn| at each of the CORNERS times the spacing along x, at least SMOOTHING: (corner, z, y, x), differentiable.
+
+    delta: Δn (z, y, x). spacing: of its voxels (z, y, x), µm.
+    """
     squares = delta.new_full((len(CORNERS), *delta.shape), SMOOTHING**2)
     for axis, step in enumerate(spacing):
         if delta.shape[axis] > 1:

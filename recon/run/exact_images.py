@@ -65,7 +65,8 @@ def exact_images(
     """Images of a specimen from its exact field, float64. None of torchdic's propagations takes part.
 
     specimen: knows its exact field.
-    grid: its (y, x) pixels are the images', unless the microscope's camera has pixels of its own.
+    grid: its (y, x) pixels are the images', unless the microscope's camera has pixels of its own. The field is computed
+    on an array that is wider by half of the grid's on each side.
     microscope, acquisition: as for `torchdic.image`; the camera's noise and counts are left out.
     fidelity: only its number of sources counts.
     Raises ShortOfMemoryError where there is no room for them.

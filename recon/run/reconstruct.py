@@ -150,15 +150,14 @@ def _in_tiles(config: Config, measured: Measured, fit: TiledFit) -> Result:
 class Reconstructed:
     """A finished reconstruction, read from its folder.
 
-    out: the folder. config, measured, problem: that were fitted. misfit: makes the problem's from images. step: the
-    last. identity: of all that the fit depends on.
+    out: the folder. config, measured, problem: that were fitted. step: the last. identity: of all that the fit depends
+    on.
     """
 
     out: Path
     config: Config
     measured: Measured
     problem: Problem
-    misfit: Callable[[Tensor], Misfit]
     step: Step
     identity: str
 
@@ -173,7 +172,7 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
     missing = [name for name in (VOLUME, RESOLVED) if not (out / name).exists()]
     if missing:
         raise ConfigError(f"{out}: holds no finished reconstruction: {' and '.join(missing)} missing")
-    config, measured, misfit, problem, identity = _asked(load(resolved), device)
+    config, measured, _, problem, identity = _asked(load(resolved), device)
     if config.reconstruction.method in DIRECT:
         step, _ = solved_directly(config.reconstruction, problem, measured.noise)
     elif isinstance(config.reconstruction.tiles, int) and not (out / CHECKPOINT).exists():
@@ -185,7 +184,7 @@ def reconstructed(out: Path, device: torch.device) -> Reconstructed:
         step = replace(step, delta=step.delta.to(device))
     else:
         raise ConfigError(f"{out / CHECKPOINT}: missing: the fit can't be done again without it")
-    return Reconstructed(out, config, measured, problem, misfit, step, identity)
+    return Reconstructed(out, config, measured, problem, step, identity)
 
 
 def _asked(

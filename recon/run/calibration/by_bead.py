@@ -7,17 +7,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from recon.calibration.known_specimen import ModelledSpecimen, OpticsFound, find_optics, model_of
+from recon.calibration.known_specimen import PLANES, ModelledSpecimen, OpticsFound, calibrate
 from recon.calibration.optics import firsts_of
 from recon.config.schema import BeadSection, Config, ConfigError
+from recon.fit.setup import Setup, empty_medium
 from recon.run.calibration.found import DIRECTION, FoundQuantity, Value, plain, rounded, rounded_angle, rounded_shear
 from recon.run.calibration.stack import CalibrationStack
 from recon.run.data import camera_pixels
 from torchdic import Acquisition
 from torchdic.scalar import number
-
-# Planes of the stack, and µm of light around the bead on each side, that its fit takes.
-PLANES, AROUND = 7, 3.5
 
 # The least size of the field over the bead's.
 ROOM = 1.2
@@ -39,15 +37,15 @@ def by_bead(
 
     Raises ConfigError where the bead isn't found in the field.
     """
-    config, pixel = stack.config, min(stack.pixels.spacing[1:])
-    part = stack.part(math.ceil((bead.width + 2 * AROUND) / pixel), PLANES)
-    model = model_of(part, bead, config.volume.background, config.microscope)
-    print(f"the optics behind the bead, by {part.data.shape[0]} × {part.data.shape[1]} of its images …", flush=True)
+    config, data = stack.config, stack.data
+    medium = empty_medium(config.volume.grid, config.volume.background, data)
+    setup, terms = Setup(medium, config.microscope, config.acquisition), config.calibration.aberrations
+    print(f"the optics behind the bead, by {len(data)} × {min(data.shape[1], PLANES)} of its images …", flush=True)
     try:
-        found = find_optics(part, model, config.acquisition, stack.noise, config.calibration.aberrations)
+        found = calibrate(data, setup, bead, stack.noise, stack.mask, terms)
     except ValueError as error:
         raise ConfigError(f"calibration.bead: {error}") from error
-    return stack.with_config(_calibrated(config, found)), _quantities(config, found, part.planes)
+    return stack.with_config(_calibrated(config, found)), _quantities(config, found)
 
 
 def check_bead(config: Config, section: BeadSection) -> None:
@@ -88,7 +86,7 @@ def _calibrated(config: Config, found: OpticsFound) -> Config:
     )
 
 
-def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> list[FoundQuantity]:
+def _quantities(config: Config, found: OpticsFound) -> list[FoundQuantity]:
     """Each quantity that a bead tells."""
     how, whole = "by the bead", _how(found)
     declared = config.acquisition.prisms
@@ -106,7 +104,7 @@ def _quantities(config: Config, found: OpticsFound, planes: tuple[int, ...]) -> 
     made.append(_of("bead's z", "µm", None, -found.values["focus_zero"], found.deviations["focus_zero"], where))
     drift, lit = found.values["drift"], found.values["brightness"]
     moved = drift - drift.mean((0, 1))
-    of = f"{how}, of planes {', '.join(map(str, planes))} (from 0)"
+    of = f"{how}, of planes {', '.join(map(str, found.planes))} (from 0)"
     made.append(_of("drift", "µm", None, moved, found.deviations["drift"], of))
     made.append(_of("brightness", "", None, lit, found.deviations["brightness"] * lit, of))
     if "aberrations" in found.values:

@@ -3,25 +3,23 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from jaxtyping import Bool
 from torch import Tensor
-from tqdm import tqdm
 
 from recon.coverage.seen import Coverage
 from recon.earlier.direct import solved_directly
 from recon.evidence.bars import ErrorBars, bars_of
 from recon.evidence.estimate import Estimate
-from recon.evidence.refits import Kind, Refit, copy, planned_refits, refits
+from recon.evidence.refits import COPIES, NOISY, Kind, Refit, copy, planned_refits, refits
 from recon.evidence.regions import INCREMENT, as_json
 from recon.fit.descent import solved
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Step
-from recon.recording.noise import noise_of_level
+from recon.recording.noise import NoiseModel, noise_of_level
 from recon.report import figures
 from recon.run.evidence.figure import draw_error_bars
 from recon.run.evidence.kept_refits import ERROR_BARS, FOLDER, KeptRefits
@@ -46,8 +44,8 @@ class Wanted:
     outlines: drawn around parts of the volume, (z, y, x), by name.
     """
 
-    noise: int = 16
-    copies: int = 8
+    noise: int = NOISY
+    copies: int = COPIES
     increment: float = INCREMENT
     outlines: Mapping[str, Bool[Tensor, "z y x"]] | None = None
 
@@ -69,7 +67,7 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
     missing = kept.missing(planned)
     began = time.perf_counter()
     try:
-        for refit in tqdm(refits(estimate, missing), desc="refits", unit="fit", total=len(missing)):
+        for refit in refits(estimate, missing):
             kept.keep(refit)
     except KeyboardInterrupt:
         left = len(kept.missing(planned))
@@ -85,7 +83,7 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
 
 def estimate_of(done: Reconstructed) -> Estimate:
     """A finished reconstruction as an estimate. Raises StackError where the noise of its stack isn't known."""
-    return Estimate(done.problem, done.step, _noise_of(done), done.misfit, _solver(done))
+    return Estimate.of_fit(done.problem, done.step, _noise_of(done), _solver(done))
 
 
 def poor_fit(out: Path) -> str | None:
@@ -103,16 +101,14 @@ def _solver(done: Reconstructed) -> Callable[[Problem], Step]:
     return directly if done.config.reconstruction.method in DIRECT else solved
 
 
-def _noise_of(done: Reconstructed) -> Callable[[Tensor], Tensor]:
-    """The noise of each pixel of given images: by the camera's gain where it is known, else each prism's."""
+def _noise_of(done: Reconstructed) -> NoiseModel | Sequence[float]:
+    """The noise of the stack: by the camera's gain where it is known, else each prism's."""
     measured = done.measured
-    model = noise_model(done.config, measured) or noise_of_level(measured.data, measured.left_out.counted)
-    if model is not None:
-        return lambda images: model.like(images).variance(images).sqrt()
-    if measured.noise is None:
+    told = noise_model(done.config, measured) or noise_of_level(measured.data, measured.left_out.counted)
+    told = told or measured.noise
+    if told is None:
         raise StackError(f"{done.out}: the noise of images so small can't be measured: there are no error bars without")
-    levels = torch.tensor(measured.noise)[:, None, None, None]
-    return lambda images: levels.to(images)
+    return told
 
 
 def _identity(done: Reconstructed) -> str:
