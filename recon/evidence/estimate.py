@@ -68,21 +68,28 @@ class Estimate:
         drawn = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed))
         return images + self.noise(images) * drawn.to(images)
 
-    def refitted(
+    def of_other_images(
         self, images: Float[Tensor, "prism focus y x"], *, going_on: bool = False, anywhere: bool = False
-    ) -> Float[Tensor, "z y x"]:
-        """Δn of the whole volume by a fit of other images, as that of the first ones was in the end.
+    ) -> Problem | None:
+        """The problem of other images, to be solved as that of the first ones was in the end.
 
         going_on: start from this estimate; else anew. anywhere: without a support, where the specimen is another one.
-        Images that are uniform show nothing: their volume is empty.
+        None for images that are uniform: they show nothing.
         """
         try:
             misfit = self.misfit(images)
         except UniformImagesError:  # as where a dark field has no noise
-            return torch.zeros_like(self.delta)
+            return None
         newton = self.problem.method == "newton"  # what Adam ends with depends on the number of its steps
         problem = self.problem.again(misfit, self.step, self.delta if going_on and newton else None)
-        return self.solve(_unsupported(problem) if anywhere else problem).delta
+        return _unsupported(problem) if anywhere else problem
+
+    def refitted(
+        self, images: Float[Tensor, "prism focus y x"], *, going_on: bool = False, anywhere: bool = False
+    ) -> Float[Tensor, "z y x"]:
+        """Δn of the whole volume by a fit of other images, see `of_other_images`; empty where these show nothing."""
+        problem = self.of_other_images(images, going_on=going_on, anywhere=anywhere)
+        return torch.zeros_like(self.delta) if problem is None else self.solve(problem).delta
 
 
 def _pixels_noise(misfit: Misfit, told: NoiseModel | Sequence[float] | None) -> Callable[[Tensor], Tensor]:

@@ -10,16 +10,21 @@ images see little. It is known; it is recorded like the specimen, with noise, an
 from it is the whole error of such a fit.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from tqdm import tqdm
 
 from recon.evidence.estimate import Estimate
 from recon.evidence.turned import middle, turn, turned
+from recon.fit.problem import Problem
+from recon.fit.step import Step
+from torchdic.ranks.each import each
 
 # What a refit is of, and with its number from 0, which one it is.
 Kind = Literal["noiseless", "noise", "turned"]
@@ -56,24 +61,34 @@ def planned_refits(noise: int, copies: int) -> list[Named]:
     ]
 
 
-def refits(estimate: Estimate, wanted: list[Named]) -> Iterator[Refit]:
-    """The refits that are wanted, one by one as they are done, beside a bar that says so.
+def refits(estimate: Estimate, wanted: Sequence[Named], *, at_once: bool = True) -> Iterator[Refit]:
+    """The refits that are wanted, in this order, as they are done, beside a bar that says so.
 
-    Each depends on its kind and number alone.
+    Each depends on its kind and number alone. at_once: whether of several processes each does one by itself, where the
+    estimate's function that solves must be one of a module; else all of them do one after the other together.
     """
-    setup = estimate.problem.setup
     own = estimate.images(estimate.delta) if any(kind != "turned" for kind, _ in wanted) else None
-    for kind, number in tqdm(wanted, desc="refits", unit="fit"):
+
+    def problem(kind: Kind, number: int) -> Problem | None:
         if kind == "turned":
-            truth = copy(estimate, number)
-            images = estimate.recorded(estimate.images(truth), SEEDS_OF_COPIES + number)
-            found = estimate.refitted(images, anywhere=True)
-            yield Refit(kind, number, setup.within_field(found).cpu(), setup.within_field(truth).cpu())
-            continue
+            images = estimate.images(copy(estimate, number))
+            return estimate.of_other_images(estimate.recorded(images, SEEDS_OF_COPIES + number), anywhere=True)
         assert own is not None
         noisy = kind == "noise"
-        found = estimate.refitted(estimate.recorded(own, number) if noisy else own, going_on=noisy)
-        yield Refit(kind, number, setup.within_field(found).cpu())
+        return estimate.of_other_images(estimate.recorded(own, number) if noisy else own, going_on=noisy)
+
+    problems, solve = (problem(*one) for one in wanted), partial(_solved, estimate.solve)
+    within = estimate.problem.setup.within_field
+    volumes = each(solve, problems) if at_once else map(solve, problems)
+    for (kind, number), found in zip(tqdm(wanted, desc="refits", unit="fit"), volumes, strict=True):
+        delta = torch.zeros_like(estimate.delta) if found is None else found
+        truth = within(copy(estimate, number)).cpu() if kind == "turned" else None
+        yield Refit(kind, number, within(delta).cpu(), truth)
+
+
+def _solved(solve: Callable[[Problem], Step], problem: Problem | None) -> Float[Tensor, "z y x"] | None:
+    """Δn of a problem's solution; None where there is no problem."""
+    return None if problem is None else solve(problem).delta
 
 
 def copy(estimate: Estimate, number: int) -> Float[Tensor, "z y x"]:

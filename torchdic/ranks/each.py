@@ -1,6 +1,7 @@
 """Many things of one kind computed by all ranks at once, each by one of them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import TypeVar
 
 from torchdic.ranks.group import rank, ranks, shares_out
@@ -10,7 +11,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def each(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """function(item) of each item, in their order, as soon as it and those before it are there.
 
     As many are computed at once as there are ranks, each by one of them, which computes by itself; by one process, one
@@ -19,8 +20,8 @@ def each(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[
     if not shares_out():
         yield from map(function, items)
         return
-    for first in range(0, len(items), ranks()):
-        some = items[first : first + ranks()]
+    left = iter(items)
+    while some := list(islice(left, ranks())):
         yield from everywhere(_own, function, some)[: len(some)]
 
 

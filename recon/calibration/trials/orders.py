@@ -151,7 +151,7 @@ class _Race:
         return left[0] < STANDS_OUT * left[len(left) // 2]
 
 
-class _Fit(NamedTuple):
+class _ShortFit(NamedTuple):
     """The misfit of a short fit's volume, also with priors, and their weight; infinite and None without a volume."""
 
     misfit: float = math.inf
@@ -159,13 +159,13 @@ class _Fit(NamedTuple):
     weight: float | None = None
 
 
-def _fitted(asked: tuple[Problem, Round]) -> _Fit:
+def _fitted(asked: tuple[Problem, Round]) -> _ShortFit:
     """A description's short fit; without a volume where its light can't be followed."""
     problem, this = asked
     last = last_step(problem, this.steps, this.sources)
     if last is None:
-        return _Fit()
-    return _Fit(last.misfit, last.loss, float(last.weights[-1]["tv"]) if last.weights else None)
+        return _ShortFit()
+    return _ShortFit(last.misfit, last.loss, float(last.weights[-1]["tv"]) if last.weights else None)
 
 
 def _held(recipe: Recipe, weight: float | None) -> Recipe:

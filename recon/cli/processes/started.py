@@ -5,18 +5,19 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import torch
 
-from recon.cli.exit_codes import FAILED
+from recon.cli.exit_codes import FAILED, INTERRUPTED
 from recon.cli.processes.together import take_part
 from recon.cli.processes.torchrun import ProcessPlace, fail
+from torchdic.ranks.signals import ignore_signals
 
 # Seconds that the others have to end in once this process has ended its part.
 PATIENCE = 10.0
@@ -38,16 +39,20 @@ def by_several(processes: int, command: Callable[[], int]) -> int:
     torch.set_num_threads(max(1, torch.get_num_threads() // processes))
     if sys.platform in LOOPBACK:
         os.environ.setdefault(NETWORK, LOOPBACK[sys.platform])
-    with tempfile.TemporaryDirectory(prefix="torchdic-") as folder:
-        method = f"{Path(folder).as_uri()}/store"
-        with _others(processes, method) as ready:
-            for number, told in enumerate(ready, 1):
-                try:
-                    told.recv()
-                except EOFError:
-                    fail(f"--processes {processes}: process {number} ended before it could compute")
-                    return FAILED
-            return take_part(ProcessPlace(0, processes, 0, processes), command, method)
+    try:
+        with tempfile.TemporaryDirectory(prefix="torchdic-") as folder:
+            method = f"{Path(folder).as_uri()}/store"
+            with _others(processes, method) as ready:
+                for number, told in enumerate(ready, 1):
+                    try:
+                        told.recv()
+                    except EOFError:
+                        fail(f"--processes {processes}: process {number} ended before it could compute")
+                        return FAILED
+                return take_part(ProcessPlace(0, processes, 0, processes), command, method)
+    except KeyboardInterrupt:  # before the command has begun, which answers to it itself
+        fail("interrupted")
+        return INTERRUPTED
 
 
 @contextmanager
@@ -58,7 +63,7 @@ def _others(processes: int, method: str) -> Iterator[list[Connection]]:
     ready: list[Connection] = []
     threads = torch.get_num_threads()
     try:
-        with _interrupts_ignored():
+        with _interrupts_later():
             for number in range(1, processes):
                 receiver, sender = spawn.Pipe(duplex=False)
                 place = ProcessPlace(number, processes, number, processes)
@@ -77,6 +82,9 @@ def _others(processes: int, method: str) -> Iterator[list[Connection]]:
 
 def _compute(place: ProcessPlace, method: str, threads: int, ready: Connection) -> None:
     """What each of the others does."""
+    ignore_signals()  # the terminal sends Ctrl-C to all: the first answers to it
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     torch.set_num_threads(threads)
     ready.send(True)
     sys.exit(take_part(place, _nothing, method))
@@ -87,13 +95,14 @@ def _nothing() -> int:
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """What is started within this block ignores Ctrl-C, which the terminal sends to all; the first answers to it."""
-    if threading.current_thread() is not threading.main_thread():
+def _interrupts_later() -> Iterator[None]:
+    """A Ctrl-C within this block is handled at its end, and not at all by what is started in it, see `_compute`."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    resource_tracker.ensure_running()  # multiprocessing's own, which else is started below and lets signals through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

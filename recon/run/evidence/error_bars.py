@@ -19,6 +19,7 @@ from recon.evidence.regions import INCREMENT, as_json
 from recon.fit.descent import solved
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Step
+from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.noise import NoiseModel, noise_of_level
 from recon.report import figures
 from recon.run.evidence.figure import draw_error_bars
@@ -29,9 +30,12 @@ from recon.run.interruption import InterruptedRunError
 from recon.run.misfits import noise_model
 from recon.run.reconstruct import Reconstructed
 from recon.run.results import METRICS
+from recon.run.room import check_room_for_descent
+from torchdic import ShortOfMemoryError
 from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
+from torchdic.ranks.group import ranks_here
 
 DEVIATION, TOTAL = "sd.ome.tif", "error.ome.tif"
 
@@ -67,7 +71,7 @@ def error_bars(done: Reconstructed, wanted: Wanted, *, restart: bool = False) ->
     missing = kept.missing(planned)
     began = time.perf_counter()
     try:
-        for refit in refits(estimate, missing):
+        for refit in refits(estimate, missing, at_once=_at_once(done)):
             kept.keep(refit)
     except KeyboardInterrupt:
         left = len(kept.missing(planned))
@@ -90,6 +94,17 @@ def poor_fit(out: Path) -> str | None:
     """What a reconstruction's verdict says where its volume doesn't explain the stack; None where it does."""
     verdict = json.loads((out / METRICS).read_text(encoding="utf-8"))["verdict"]
     return str(verdict["words"]) if verdict["poor"] else None
+
+
+def _at_once(done: Reconstructed) -> bool:
+    """Whether each of several processes fits by itself: where there is room for all of these fits."""
+    if done.config.reconstruction.method in DIRECT:
+        return False
+    try:
+        check_room_for_descent(done.problem, GaussianMisfit, at_once=ranks_here())
+    except ShortOfMemoryError:
+        return False
+    return True
 
 
 def _solver(done: Reconstructed) -> Callable[[Problem], Step]:
