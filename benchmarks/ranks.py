@@ -1,11 +1,13 @@
 """What processes gain: a bead is reconstructed by several of them, and each one's processor time is measured.
 
-    OMP_NUM_THREADS=1 python benchmarks/ranks.py [--ranks 1 2 4] [--what images newton adam]
+    OMP_NUM_THREADS=1 python benchmarks/ranks.py [--ranks 1 2 4] [--what images newton adam calibrate error-bars]
 
 torchrun starts the processes on this machine. Processor seconds are those of each process after its imports. A process
 that waits for others takes none, so rank 0's are about what the run would take by the clock on as many idle cores. The
 difference is that of the volume from one process's, the largest and the rms, over the largest and the rms of Δn.
-"images" are images of 128 directions with their gradient to the volume, one after the other, and nothing besides.
+"images" are images of 128 directions with their gradient to the volume, one after the other, and nothing besides. For
+"calibrate" the difference is that of each image's brightness, for "error-bars" that of the deviation by noise; both are
+of a smaller bead.
 """
 
 import argparse
@@ -25,7 +27,7 @@ from torchdic import Acquisition, Condenser, Fidelity, Grid, Microscope, Objecti
 
 CONFIG = """
 [volume]
-shape = [24, 144, 144]
+shape = {shape}
 spacing = [0.4, 0.2, 0.2]
 background = 1.4
 [microscope]
@@ -38,7 +40,7 @@ focus = [-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0]
 prisms = [{{ shear = [0.0, 0.24], bias = 1.5 }}, {{ shear = [0.24, 0.0], bias = 1.5 }}]
 [specimen]
 kind = "bead"
-radius = 3.5
+radius = {radius}
 contrast = 0.02
 [data]
 path = "made/stack.ome.tif"
@@ -47,6 +49,8 @@ method = "{method}"
 steps = {steps}
 """
 STEPS = {"newton": 12, "adam": 20}
+LARGE, SMALL = ([24, 144, 144], 3.5), ([12, 64, 64], 1.6)
+FITS = ("calibrate", "error-bars")
 IMAGES, DIRECTIONS = 4, 128
 
 
@@ -54,7 +58,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="A reconstruction by several processes.")
     parser.add_argument("--ranks", type=int, nargs="+", default=[1, 2, 4], help="the first is what others differ from")
-    parser.add_argument("--what", nargs="+", choices=["images", *STEPS], default=["images", *STEPS])
+    parser.add_argument("--what", nargs="+", choices=["images", *STEPS, *FITS], default=["images", *STEPS, *FITS])
     arguments = parser.parse_args()
     print("| what | processes | processor seconds of rank 0 | of each other | in all | largest difference | rms |")
     print("|---|---|---|---|---|---|---|")
@@ -74,20 +78,39 @@ def main() -> None:
 
 
 def found(what: str, ranks: int) -> tuple[list[float], np.ndarray]:
-    """The processor seconds of each rank, and Δn or its gradient (z, y, x)."""
+    """The processor seconds of each rank, and what its difference is told of."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        run = {"cwd": folder, "check": True, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+        def run(*words: str) -> None:
+            subprocess.run(
+                [sys.executable, *words], cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            )
+
         words = [what]
-        if what in STEPS:
-            (folder / "run.toml").write_text(CONFIG.format(method=what, steps=STEPS[what]), encoding="utf-8")
-            subprocess.run([sys.executable, "-m", "recon", "simulate", "run.toml", "--out", "made"], **run)
-            words = ["reconstruct", "run.toml", "--out", "found"]
-        torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)]
-        subprocess.run([*torchrun, __file__, "--one", *words], **run)
+        if what != "images":
+            method, (shape, radius) = what if what in STEPS else "newton", LARGE if what in STEPS else SMALL
+            config = CONFIG.format(shape=shape, radius=radius, method=method, steps=STEPS[method])
+            (folder / "run.toml").write_text(config, encoding="utf-8")
+            run("-m", "recon", "simulate", "run.toml", "--out", "made")
+            words = ["reconstruct" if what in STEPS else what, "run.toml", "--out", "found"]
+        if what == "error-bars":
+            run("-m", "recon", "reconstruct", "run.toml", "--out", "found")
+            words = [what, "found"]
+        torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks))
+        run(*torchrun, __file__, "--one", *words)
         spent = [json.loads((folder / f"{rank}.json").read_text(encoding="utf-8")) for rank in range(ranks)]
-        volume = folder / "found" / "volume.ome.tif"
-        return spent, tifffile.imread(volume) if volume.exists() else np.load(folder / "gradient.npy")
+        return spent, left(what, folder)
+
+
+def left(what: str, folder: Path) -> np.ndarray:
+    """What a run has left: Δn or its gradient (z, y, x), its deviation, or the images' brightness (prism, focus)."""
+    if what == "images":
+        return np.load(folder / "gradient.npy")
+    if what == "calibrate":
+        told = json.loads((folder / "found" / "calibration.json").read_text(encoding="utf-8"))
+        return np.array(told["brightness"]["value"])
+    return tifffile.imread(folder / "found" / ("volume.ome.tif" if what in STEPS else "sd.ome.tif"))
 
 
 def measure(words: list[str]) -> int:
@@ -128,6 +151,8 @@ def images() -> int:
 
 def import_all() -> None:
     """What the command imports when it is needed."""
+    import recon.cli.calibrate
+    import recon.cli.evidence.error_bars
     import recon.cli.processes.together
     import recon.cli.reconstruct
     import recon.cli.running  # noqa: F401
