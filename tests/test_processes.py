@@ -7,16 +7,19 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import pytest
 import tifffile
+from several_ranks import forked
 from small_bead import CONFIG
 
 from recon.cli import main
-from recon.cli.exit_codes import FAILED, INTERRUPTED
+from recon.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 
 WORDS = "error: another process of this run has ended"
+ENDED = "torchdic: error: --processes 2: process 1 ended before it could compute"
 
 
 @pytest.fixture
@@ -101,9 +104,34 @@ def test_a_process_that_ends_before_it_computes_ends_the_command_in_one_line(bea
 
     monkeypatch.setattr(started, "_compute", sys.exit)  # which is pickled by its name
     assert main(["reconstruct", "run.toml", "--out", "several", "--processes", "2"]) == FAILED
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == "torchdic: error: --processes 2: process 1 ended before it could compute"
+    assert capsys.readouterr().err.splitlines()[-1] == ENDED
     assert not (bead / "several").exists()
+
+
+def ready_and_gone(place, method, threads, ready):
+    """In the place of `started._compute`: a process that is killed while all of them look for each other."""
+    ready.send(True)
+
+
+@pytest.mark.slow
+def test_a_process_that_ends_while_they_look_for_each_other_ends_the_command_in_one_line(bead):
+    from recon.cli.processes import started
+
+    def run(_):
+        started._compute, sys.stderr = ready_and_gone, sys.__stderr__
+        return main(["reconstruct", "run.toml", "--out", "several", "--processes", "2"])
+
+    assert forked(run, 1, bead) == [FAILED]
+    assert (bead / "0.txt").read_text().splitlines()[-1] == ENDED
+
+
+def test_without_a_folder_for_temporary_files_a_line_says_so(bead, monkeypatch, capsys):
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        monkeypatch.setenv(name, str(bead / "missing"))
+    monkeypatch.setattr(tempfile, "tempdir", str(bead / "missing"))
+    assert main(["reconstruct", "run.toml", "--out", "several", "--processes", "2"]) == BAD_INPUT
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("torchdic: error: --processes 2: there is no folder for temporary files: ")
 
 
 @pytest.mark.slow

@@ -2,19 +2,21 @@
 
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import torch
 
-from recon.cli.exit_codes import FAILED, INTERRUPTED
+from recon.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 from recon.cli.processes.together import take_part
 from recon.cli.processes.torchrun import ProcessPlace, fail
 from torchdic.ranks.signals import ignore_signals
@@ -36,31 +38,74 @@ def by_several(processes: int, command: Callable[[], int]) -> int:
     if processes > cores:
         words = f"--processes {processes}: this machine has {cores} processors; more processes than these only wait"
         print(f"torchdic: warning: {words}", file=sys.stderr)
-    torch.set_num_threads(max(1, torch.get_num_threads() // processes))
     if sys.platform in LOOPBACK:
         os.environ.setdefault(NETWORK, LOOPBACK[sys.platform])
     try:
-        with tempfile.TemporaryDirectory(prefix="torchdic-") as folder:
-            method = f"{Path(folder).as_uri()}/store"
-            with _others(processes, method) as ready:
-                for number, told in enumerate(ready, 1):
-                    try:
-                        told.recv()
-                    except EOFError:
-                        fail(f"--processes {processes}: process {number} ended before it could compute")
-                        return FAILED
-                return take_part(ProcessPlace(0, processes, 0, processes), command, method)
+        folder = tempfile.mkdtemp(prefix="torchdic-")
+    except OSError as error:
+        fail(f"--processes {processes}: there is no folder for temporary files: {error}")
+        return BAD_INPUT
+    try:
+        with _threads_of_one(processes):
+            return _led(processes, command, Path(folder))
     except KeyboardInterrupt:  # before the command has begun, which answers to it itself
         fail("interrupted")
         return INTERRUPTED
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _led(processes: int, command: Callable[[], int], folder: Path) -> int:
+    """See `by_several`. folder: by which the processes find each other."""
+    method, begun = f"{folder.as_uri()}/store", threading.Event()
+
+    def begin() -> int:
+        begun.set()
+        return command()
+
+    with _others(processes, method) as others:
+        for number, (_, ready) in enumerate(others, 1):
+            try:
+                ready.recv()
+            except EOFError:
+                fail(_ended(number, processes))
+                return FAILED
+        threading.Thread(target=_watch, args=([one for one, _ in others], begun, folder), daemon=True).start()
+        return take_part(ProcessPlace(0, processes, 0, processes), begin, method)
+
+
+def _watch(others: Sequence[BaseProcess], begun: threading.Event, folder: Path) -> None:
+    """End all where one of the others ends while they look for each other: the wait for it has no end by itself."""
+    gone = wait([one.sentinel for one in others])
+    if begun.is_set():  # from then on a lost process is noticed where they compute
+        return
+    fail(_ended(next(n for n, one in enumerate(others, 1) if one.sentinel in gone), len(others) + 1))
+    for one in others:
+        one.kill()
+    shutil.rmtree(folder, ignore_errors=True)
+    os._exit(FAILED)
+
+
+def _ended(number: int, processes: int) -> str:
+    return f"--processes {processes}: process {number} ended before it could compute"
 
 
 @contextmanager
-def _others(processes: int, method: str) -> Iterator[list[Connection]]:
+def _threads_of_one(processes: int) -> Iterator[None]:
+    """Within this block the process has its share of the machine's threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(1, before // processes))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _others(processes: int, method: str) -> Iterator[list[tuple[BaseProcess, Connection]]]:
     """Within this block all processes but the first run, each of which says through its connection when it is ready."""
     spawn = multiprocessing.get_context("spawn")
-    started: list[BaseProcess] = []
-    ready: list[Connection] = []
+    started: list[tuple[BaseProcess, Connection]] = []
     threads = torch.get_num_threads()
     try:
         with _interrupts_later():
@@ -70,13 +115,12 @@ def _others(processes: int, method: str) -> Iterator[list[Connection]]:
                 one = spawn.Process(target=_compute, args=(place, method, threads, sender), daemon=True)
                 one.start()
                 sender.close()  # so that the connection ends with the process
-                started.append(one)
-                ready.append(receiver)
-        yield ready
-        for one in started:
+                started.append((one, receiver))
+        yield started
+        for one, _ in started:
             one.join(PATIENCE)
     finally:
-        for one in started:
+        for one, _ in started:
             one.kill()
 
 
