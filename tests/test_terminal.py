@@ -95,7 +95,9 @@ def test_a_run_outlives_a_reader_that_has_read_enough(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     ) as process:
-        assert process.stdin and process.stdout and process.stderr
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
         process.stdout.close()
         process.stdin.close()
         assert process.stderr.read() == b""
