@@ -139,6 +139,13 @@ def test_a_folder_is_looked_at_without_being_made(tmp_path):
             prepare(tmp_path / "file" / "b")
 
 
+def test_a_link_to_nothing_is_called_so(tmp_path):
+    (tmp_path / "out").symlink_to("gone")
+    for out in (tmp_path / "out", tmp_path / "out" / "below"):
+        with pytest.raises(ConfigError, match=r"out is a link to gone, which isn't there"):
+            check_folder(out)
+
+
 @pytest.fixture
 def other_run(tmp_path):
     """Another process that holds a folder, until it is killed."""
