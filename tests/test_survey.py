@@ -229,3 +229,12 @@ def test_copies_of_an_image_are_named():
     (line,) = odd_images(Stack(data, source="a.tif"))
     assert "prism 1, plane 1 and prism 2, plane 1 are the same image, pixel by pixel, and 3 further images have" in line
     assert list(odd_images(Stack(data.astype(np.float32), source="a.tif"))) == []  # of a model, which has no noise
+
+
+def test_clipped_pixels_are_named_where_no_bit_depth_tells_of_them():
+    """Those at the camera's full scale are left out, and counted, elsewhere."""
+    data = counts()
+    (line,) = odd_images(Stack(np.minimum(data, 730), source="a.tif"))
+    assert "of the pixels have the largest value, 730, and hardly any the next, 729: what was brighter" in line
+    assert list(odd_images(Stack(np.minimum(data, 730), source="a.tif", full_scale=730))) == []
+    assert list(odd_images(Stack(np.minimum(data, 800), source="a.tif"))) == []  # one pixel in 5000

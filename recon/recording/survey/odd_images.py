@@ -1,4 +1,4 @@
-"""Images of a recording that can hardly be what was recorded: of one value, or copies of one another."""
+"""Images of a recording that can hardly be what was recorded: of one value, copies of one another, or clipped."""
 
 import hashlib
 from collections import defaultdict
@@ -8,6 +8,10 @@ import numpy as np
 from jaxtyping import Bool
 
 from torchdic.files.format import Stack
+
+# Noise leaves few pixels at the largest value and hardly more than at the next one. Where they are more than these
+# parts of all pixels, and of those at the next value, a camera or a program has clipped what was brighter.
+_AT_TOP, _OF_NEXT = 0.01, 4
 
 
 def odd_images(
@@ -37,4 +41,19 @@ def odd_images(
         yield (
             f"{copies[0][0]} and {copies[0][1]} are the same image, pixel by pixel{more}: likely a file or a plane was "
             "taken twice in place of another"
+        )
+    yield from _clipped(stack)
+
+
+def _clipped(stack: Stack) -> Iterator[str]:
+    """A line where pixels are clipped below the camera's full scale, so that they aren't taken as saturated."""
+    data, top = stack.data, stack.data.max()
+    share, below = float((data == top).mean()), data[data < top]
+    if top == stack.saturation or share <= _AT_TOP or not below.size:
+        return
+    if share > _OF_NEXT * float((data == below.max()).mean()):
+        yield (
+            f"{share:.1%} of the pixels have the largest value, {top:g}, and hardly any the next, {below.max():g}: "
+            "what was brighter has been clipped, by the camera or by a program; take the counts from before, or leave "
+            "these pixels out (data.mask)"
         )
