@@ -198,6 +198,15 @@ def test_floats_without_a_background_are_surveyed_too():
     assert torch.isfinite(torch.tensor(found.settings[0].unevenness))
 
 
+def test_a_dropped_frame_tells_no_gain_and_hides_none():
+    light = np.linspace(200, 2000, 96)[None, None, :] * np.ones((4, 96, 1))
+    images = np.round(np.random.default_rng(5).poisson(light) * 0.5 + 100).astype(np.uint16)
+    found, dropped = dark_counts(images), dark_counts(np.concatenate([images, np.zeros_like(images[:1])]))
+    assert found is not None
+    assert dropped is not None
+    assert dropped.gain == pytest.approx(found.gain, rel=1e-6)
+
+
 def counts():
     """A stack of two settings and four planes, noise about 700 counts."""
     return np.random.default_rng(3).poisson(700, (2, 4, 24, 24)).astype(np.uint16)
