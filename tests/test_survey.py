@@ -246,4 +246,5 @@ def test_clipped_pixels_are_named_where_no_bit_depth_tells_of_them():
     (line,) = odd_images(Stack(np.minimum(data, 730), source="a.tif"))
     assert "of the pixels have the largest value, 730, and hardly any the next, 729: what was brighter" in line
     assert list(odd_images(Stack(np.minimum(data, 730), source="a.tif", full_scale=730))) == []
+    assert list(odd_images(Stack(np.minimum(data, 730), source="a.tif"), data < 730)) == []
     assert list(odd_images(Stack(np.minimum(data, 800), source="a.tif"))) == []  # one pixel in 5000

@@ -54,7 +54,7 @@ def _usual_mistake(text: str, error: str) -> str | None:
     if (place := _PLACE.search(error)) is None:
         return None
     number = int(place[1])
-    line = text.splitlines()[number - 1].strip() if number <= len(text.splitlines()) else ""
+    line = text.split("\n")[number - 1].strip()
     if (quote := next((sign for sign in _QUOTES if sign in line.partition("#")[0]), None)) is not None:
         return f'line {number} has the quotation mark {quote}: write "'
     if error.startswith(("Unescaped '\\'", "Invalid hex value")):

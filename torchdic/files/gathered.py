@@ -205,12 +205,9 @@ def _lacking(files: Sequence[Path], places: Sequence[tuple[int, int]], prism: in
     at: dict[tuple[int, int], Path] = {}
     for file, place in zip(files, places, strict=True):
         if place in at:
-            signed = (
-                ""
-                if re.search(_SIGNED, file.stem) is None
-                else ": signs and decimals aren't read, so name planes z1, z2, …"
-            )
-            return f"{at[place].name} and {file.name} are of one setting and plane{signed}"
+            signed = re.search(_SIGNED, file.stem) is not None
+            hint = ": signs and decimals aren't read, so name planes z1, z2, …" if signed else ""
+            return f"{at[place].name} and {file.name} are of one setting and plane{hint}"
         at[place] = file
     settings, depths = ({place[i]: file for place, file in at.items()} for i in (0, 1))
     names = [

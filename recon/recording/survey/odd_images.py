@@ -42,14 +42,14 @@ def odd_images(
             f"{copies[0][0]} and {copies[0][1]} are the same image, pixel by pixel{more}: likely a file or a plane was "
             "taken twice in place of another"
         )
-    yield from _clipped(stack)
+    yield from _clipped(stack.data if counted is None else stack.data[counted], stack.saturation)
 
 
-def _clipped(stack: Stack) -> Iterator[str]:
+def _clipped(data: np.ndarray, saturation: float | None) -> Iterator[str]:
     """A line where pixels are clipped below the camera's full scale, so that they aren't taken as saturated."""
-    data, top = stack.data, stack.data.max()
+    top = data.max()
     share, below = float((data == top).mean()), data[data < top]
-    if top == stack.saturation or share <= _AT_TOP or not below.size:
+    if top == saturation or share <= _AT_TOP or not below.size:
         return
     if share > _OF_NEXT * float((data == below.max()).mean()):
         yield (
