@@ -224,6 +224,7 @@ def test_an_image_of_one_value_is_named_and_the_others_are_surveyed():
     (line,) = odd_images(stack)
     assert line.startswith("prism 2, plane 3: all its pixels are 0, nothing is recorded in it")
     assert list(odd_images(stack, data > 0)) == []
+    assert list(odd_images(Stack(np.zeros_like(data), source="a.tif"))) == []  # a setting of one value is refused
     found = survey(stack, 3.0)
     # of four planes with a dark one the median is the mean of the lower two of three, 0.4 deviations of 4 % too low
     assert all(setting.level == pytest.approx(700, rel=0.03) for setting in found.settings)

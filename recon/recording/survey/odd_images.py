@@ -20,9 +20,10 @@ def odd_images(
     """A line for what is likely wrong with whole images of a stack of counts, of which no two can be alike by chance.
 
     counted: the pixels that count (True), None is all; an image without any is left aside. prism: what a setting is
-    called. Floats may be of a model without noise: of them nothing is said.
+    called. Floats may be of a model without noise: of them nothing is said. Nor is it of a stack with a setting that is
+    of one value altogether, which is refused elsewhere.
     """
-    if stack.data.dtype.kind not in "iu":
+    if stack.data.dtype.kind not in "iu" or any(images.min() == images.max() for images in stack.data):
         return
     alike: dict[bytes, list[str]] = defaultdict(list)
     for place in np.ndindex(*stack.data.shape[:2]):
