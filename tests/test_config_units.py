@@ -102,6 +102,21 @@ def test_another_fault_is_not_put_down_to_a_comma(put):
     assert "decimal comma" not in the_error(put(text.encode()))
 
 
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("path = “stack.tif”", 'line 2 has the quotation mark “: write "'),
+        ("path = ‘stack.tif’", 'line 2 has the quotation mark ‘: write "'),
+        (r'path = "data\stack.tif"', "line 2 has a single \\ in double quotes: write / between folders, or '…'"),
+        (r'path = "C:\Users\me.tif"', "line 2 has a single \\ in double quotes"),
+        ('path = "a.tif"\npath = "b.tif"', 'line 3 says again what was said before: path = "b.tif"'),
+        ("path = ", "is not TOML: Invalid value (at line 2"),
+    ],
+)
+def test_the_usual_mistakes_of_toml_are_told_with_their_line(put, line, message):
+    assert message in the_error(put(f"[data]  # “measured”\n{line}\n".encode()))
+
+
 # --- units ------------------------------------------------------------------------------------------------------------
 
 SPECIMEN = {"kind": "bead", "radius": 2.5, "contrast": 0.03}

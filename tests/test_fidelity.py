@@ -25,9 +25,9 @@ def test_presets_are_ordered_by_care():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps 0 must be at least 1"),
-        ({"sources": 0}, "sources 0 must be at least 1"),
-        ({"padding": -1}, "padding -1 must be at least 0"),
+        ({"steps": 0}, "steps 0 must be a whole number of at least 1"),
+        ({"sources": 0}, "sources 0 must be a whole number of at least 1"),
+        ({"padding": -1}, "padding -1 must be a whole number of at least 0"),
         ({"tolerance": 0.0}, r"tolerance 0\.0 must be above 0, and finite"),
         ({"tolerance": math.nan}, "tolerance nan must be above 0"),
         ({"tolerance": math.inf}, "tolerance inf must be above 0, and finite"),

@@ -4,6 +4,7 @@ import argparse
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from recon.cli import main
@@ -13,6 +14,7 @@ from recon.run.folder.index import FILES
 from recon.run.folder.lock import folders_released, hold
 from recon.run.folder.prepared import check_folder, prepare_folder
 from recon.run.folder.results import FinishedError, check_no_results
+from torchdic.files.stack import write_stack
 
 # Of each command the files that a finished run leaves, each of which it would replace.
 LEAVES = {
@@ -83,6 +85,40 @@ data = { path = "missing.tif" }
 """
 
 
+@pytest.mark.parametrize("name", ["volume.ome.tif", "images.ome.tif"])
+def test_a_reconstruction_replaces_no_volume_unasked_that_came_from_elsewhere(tmp_path, capsys, name):
+    (tmp_path / "in.toml").write_text(CONFIG.replace("missing.tif", "stack.tif"))
+    write_stack(tmp_path / "stack.tif", np.random.default_rng(0).normal(0.5, 0.1, (1, 1, 8, 8)).astype(np.float32))
+    (tmp_path / name).write_text("precious")
+    line = said_no(capsys, "reconstruct", tmp_path / "in.toml", "--out", tmp_path)
+    assert f"{name}: the folder has results; name another one, or replace them with --restart" in line
+    assert (tmp_path / name).read_text() == "precious"
+
+
+@pytest.mark.parametrize("key", ["path", "mask", "empty"])
+def test_a_reconstruction_never_replaces_what_it_reads(tmp_path, capsys, key):
+    named = {"path": "missing.tif", key: "link/images.ome.tif"}
+    data = ", ".join(f'{name} = "{file}"' for name, file in named.items())
+    (tmp_path / "in.toml").write_text(CONFIG.replace('path = "missing.tif"', data))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "link").symlink_to("out")
+    (tmp_path / "out" / "images.ome.tif").write_text("precious")
+    for asked in ("--restart", "--resume"):
+        line = said_no(capsys, "reconstruct", tmp_path / "in.toml", "--out", tmp_path / "out", asked)
+        assert "images.ome.tif: is read, and a result of that name would replace it; name another folder" in line
+    assert (tmp_path / "out" / "images.ome.tif").read_text() == "precious"
+
+
+def test_no_other_command_replaces_what_it_reads(tmp_path, capsys):
+    for name, words in {
+        "phase.ome.tif": ("phase", tmp_path / "phase.ome.tif", "--out", tmp_path, "--restart"),
+        "sd.ome.tif": ("error-bars", tmp_path, "--regions", tmp_path / "sd.ome.tif"),
+    }.items():
+        (tmp_path / name).write_text("precious")
+        assert f"{name}: is read, and a result of that name would replace it" in said_no(capsys, *words)
+        assert (tmp_path / name).read_text() == "precious"
+
+
 def test_only_results_stand_in_the_way_and_only_unasked(tmp_path):
     check_no_results(tmp_path, ("a.json", "b.json"), restart=False)
     (tmp_path / "b.json").write_text("{}")
@@ -101,6 +137,13 @@ def test_a_folder_is_looked_at_without_being_made(tmp_path):
     for prepare in (check_folder, prepare_folder):
         with pytest.raises(ConfigError, match="can't be written to"):
             prepare(tmp_path / "file" / "b")
+
+
+def test_a_link_to_nothing_is_called_so(tmp_path):
+    (tmp_path / "out").symlink_to("gone")
+    for out in (tmp_path / "out", tmp_path / "out" / "below"):
+        with pytest.raises(ConfigError, match=r"out is a link to gone, which isn't there"):
+            check_folder(out)
 
 
 @pytest.fixture

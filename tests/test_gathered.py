@@ -145,6 +145,15 @@ def test_the_file_that_a_stack_of_settings_and_planes_lacks_is_named(tmp_path):
         gather([twice])
 
 
+@pytest.mark.parametrize("name", [lambda _, p: f"z{p - 6}.tif", lambda _, p: f"z{p / 2 - 3:+.1f}um.tif"])
+def test_numbers_with_signs_or_decimals_are_said_to_count_no_planes(tmp_path, name):
+    folder = planes(tmp_path / "planes", name, STACK[:1])
+    with pytest.raises(
+        StackError, match=r"are of one setting and plane: signs and decimals aren't read, so name planes z1"
+    ):
+        gather([folder])
+
+
 def test_a_plane_that_the_names_leave_out_is_warned_of(tmp_path):
     """Every second plane is no gap."""
     folder = planes(tmp_path / "planes", lambda _, p: f"cell z{p:02}.tif", STACK[:1])

@@ -153,6 +153,13 @@ def test_transmission_of_another_shape_is_an_error():
         image_field(torch.ones(2, 12, 15), GRID, microscope(), Acquisition(), background=N0)
 
 
+def test_transmission_that_is_not_finite_is_an_error():
+    hole = torch.ones(GRID.shape[1:])
+    hole[2, 3] = math.nan
+    with pytest.raises(ValueError, match="transmission holds 1 values that are not finite"):
+        image_field(hole, GRID, microscope(), Acquisition(), background=N0)
+
+
 @pytest.mark.parametrize("wavelength", [0.0, -0.5, math.inf, math.nan])
 def test_wavelength_must_be_above_zero(wavelength):
     with pytest.raises(ValueError, match=r"wavelength .* must be above 0"):

@@ -696,3 +696,21 @@ def test_drawn_recordings_give_back_their_shears_signs_and_axes(tmp_path, seed):
         sign = math.copysign(1.0, float(prism.bias)) * math.copysign(1.0, float(true.bias))
         wrong = math.degrees(math.atan2(sign * (ty * x - tx * y), sign * (ty * y + tx * x)))
         assert abs(wrong) < 3 * uncertainty + 0.5  # which is printed as a whole number
+
+
+@pytest.mark.filterwarnings("default::torchdic.errors.StackWarning", "ignore::recon.report.verdict.PoorFitWarning")
+def test_a_dropped_frame_and_a_file_taken_twice_are_warned_of_before_they_cost_time(tmp_path, recording, capsys):
+    data = recording.data.copy()
+    data[0, 1] = 0
+    data[1, 2] = data[1, 1]
+    write_stack(tmp_path / "odd.ome.tif", data, (0.15, 0.15), 0.5)
+    assert main(["new", str(tmp_path / "odd.ome.tif"), "--out", str(tmp_path / "run.toml")]) == 0
+    said = capsys.readouterr().out
+    assert "warning: setting 1, plane 2: all its pixels are 0, nothing is recorded in it" in said
+    assert "warning: setting 2, plane 2 and setting 2, plane 3 are the same image, pixel by pixel" in said
+    text = (tmp_path / "run.toml").read_text(encoding="utf-8") + "steps = 1\n"
+    (tmp_path / "run.toml").write_text(text, encoding="utf-8")
+    assert main(["reconstruct", str(tmp_path / "run.toml"), "--out", str(tmp_path / "volume")]) == 0
+    said = capsys.readouterr().err
+    assert "prism 1, plane 2: all its pixels are 0, nothing is recorded in it" in said
+    assert "prism 2, plane 2 and prism 2, plane 3 are the same image" in said

@@ -506,3 +506,14 @@ def test_opd_is_the_difference_of_paths_from_the_plane_wave():
     assert float(found.opd) == pytest.approx(expected, abs=1e-6)
     np.testing.assert_allclose(found.position[0], end[:2], atol=1e-5)
     np.testing.assert_allclose(found.momentum[0], end[2:4], atol=1e-5)
+
+
+def test_rays_of_another_dtype_are_converted_with_their_graph(smooth_field):
+    grid = Grid((5, 8, 9), (0.4, 0.2, 0.2))
+    volume = Volume(grid, smooth_field(grid, 0.02), N0)
+    position = torch.zeros(3, 2, dtype=torch.float32, requires_grad=True)
+    found = trace(volume, Rays(position, torch.zeros(3, 2), torch.zeros(3)), Fidelity("rays"))
+    assert found.opd.dtype == found.position.dtype == volume.delta.dtype == torch.float64
+    (gradient,) = torch.autograd.grad(found.position.sum(), position)
+    assert gradient.dtype == torch.float32
+    assert gradient.abs().min() > 0.5  # δx hardly depends on where a ray starts

@@ -15,6 +15,7 @@ from data_synthetic.scenes.fibre import Fibre
 from recon.recording.survey.dark_counts import dark_counts
 from recon.recording.survey.direction import shear_direction
 from recon.recording.survey.focus import sharpest_plane, sharpness
+from recon.recording.survey.odd_images import odd_images
 from recon.recording.survey.survey import survey
 from torchdic import Acquisition, Camera, Condenser, Grid, Microscope, Objective, Prism
 from torchdic.files.format import Stack
@@ -195,3 +196,56 @@ def test_floats_without_a_background_are_surveyed_too():
     assert apart(direction, 40) < 3
     assert found.camera is None
     assert torch.isfinite(torch.tensor(found.settings[0].unevenness))
+
+
+def test_a_dropped_frame_tells_no_gain_and_hides_none():
+    light = np.linspace(200, 2000, 96)[None, None, :] * np.ones((4, 96, 1))
+    images = np.round(np.random.default_rng(5).poisson(light) * 0.5 + 100).astype(np.uint16)
+    found, dropped = dark_counts(images), dark_counts(np.concatenate([images, np.zeros_like(images[:1])]))
+    assert found is not None
+    assert dropped is not None
+    assert dropped.gain == pytest.approx(found.gain, rel=1e-6)
+
+
+def counts():
+    """A stack of two settings and four planes, noise about 700 counts."""
+    return np.random.default_rng(3).poisson(700, (2, 4, 24, 24)).astype(np.uint16)
+
+
+def test_images_that_differ_are_not_odd():
+    assert list(odd_images(Stack(counts(), source="a.tif"))) == []
+
+
+def test_an_image_of_one_value_is_named_and_the_others_are_surveyed():
+    """As of a frame that a camera dropped; not where a mask leaves it out."""
+    data = counts()
+    data[1, 2] = 0
+    stack = Stack(data, source="a.tif")
+    (line,) = odd_images(stack)
+    assert line.startswith("prism 2, plane 3: all its pixels are 0, nothing is recorded in it")
+    assert list(odd_images(stack, data > 0)) == []
+    assert list(odd_images(Stack(np.zeros_like(data), source="a.tif"))) == []  # a setting of one value is refused
+    found = survey(stack, 3.0)
+    # of four planes with a dark one the median is the mean of the lower two of three, 0.4 deviations of 4 % too low
+    assert all(setting.level == pytest.approx(700, rel=0.03) for setting in found.settings)
+
+
+def test_copies_of_an_image_are_named():
+    data = counts()
+    data[1, 1] = data[0, 2]
+    (line,) = odd_images(Stack(data, source="a.tif"), prism="setting")
+    assert line.startswith("setting 1, plane 3 and setting 2, plane 2 are the same image, pixel by pixel: likely")
+    data[1] = data[0]
+    (line,) = odd_images(Stack(data, source="a.tif"))
+    assert "prism 1, plane 1 and prism 2, plane 1 are the same image, pixel by pixel, and 3 further images have" in line
+    assert list(odd_images(Stack(data.astype(np.float32), source="a.tif"))) == []  # of a model, which has no noise
+
+
+def test_clipped_pixels_are_named_where_no_bit_depth_tells_of_them():
+    """Those at the camera's full scale are left out, and counted, elsewhere."""
+    data = counts()
+    (line,) = odd_images(Stack(np.minimum(data, 730), source="a.tif"))
+    assert "of the pixels have the largest value, 730, and hardly any the next, 729: what was brighter" in line
+    assert list(odd_images(Stack(np.minimum(data, 730), source="a.tif", full_scale=730))) == []
+    assert list(odd_images(Stack(np.minimum(data, 730), source="a.tif"), data < 730)) == []
+    assert list(odd_images(Stack(np.minimum(data, 800), source="a.tif"))) == []  # one pixel in 5000

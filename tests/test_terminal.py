@@ -77,3 +77,38 @@ def test_the_installed_command_answers_in_ascii(tmp_path):
     assert b"No such file or directory" in done.stderr
     assert b"UnicodeEncodeError" not in done.stderr
     assert done.returncode == 2
+
+
+def test_a_run_outlives_a_reader_that_has_read_enough(tmp_path):
+    """As of `torchdic … | head -1`: what follows is lost, and no more; errors still reach stderr."""
+    program = (
+        "import sys; from recon.cli import main; from recon.report.terminal import write_plainly\n"
+        "write_plainly(); sys.stdin.read()\n"
+        "for _ in range(2): print('x' * 100_000, flush=True)\n"
+        "open('result', 'w').write('there')\n"
+        "sys.exit(main(['completion', 'bash']))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        process.stdin.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+    assert (tmp_path / "result").read_text() == "there"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device here is always full")
+def test_what_a_full_disk_keeps_from_being_printed_is_said_to_be_lost():
+    words = [sys.executable, "-m", "recon", "completion", "bash"]
+    with open("/dev/full", "w") as full:
+        found = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert found.returncode == 2
+    assert found.stderr.splitlines() == ["torchdic: error: what is printed is lost: No space left on device"]

@@ -72,6 +72,7 @@ def test_errors_state_the_numbers_and_the_law(arguments, message):
         Volume(GRID, *arguments)
 
 
-def test_whole_numbers_are_no_index():
-    with pytest.raises(ValueError, match=r"dtype torch\.int64: it must be a floating-point tensor"):
-        Volume(GRID, torch.zeros(GRID.shape, dtype=torch.int64), 1.33)
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.bfloat16, torch.complex64])
+def test_what_images_are_not_computed_in_is_no_index(dtype):
+    with pytest.raises(ValueError, match=rf"dtype {dtype}: it must be torch\.float32 or torch\.float64"):
+        Volume(GRID, torch.zeros(GRID.shape, dtype=dtype), 1.33)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, Protocol, get_args
 
 from torchdic.specimen.interpolation import Interpolation
@@ -93,12 +94,10 @@ class Fidelity:
         method = self.object_aberration
         if method is not None and method not in get_args(AberrationMethod):
             raise ValueError(f"object_aberration {method!r} must be one of 'linear', 'cone'")
-        if self.steps is not None and self.steps < 1:
-            raise ValueError(f"steps {self.steps} must be at least 1")
-        if self.sources < 1:
-            raise ValueError(f"sources {self.sources} must be at least 1")
-        if self.padding < 0:
-            raise ValueError(f"padding {self.padding} must be at least 0 voxels")
+        for name, least in (("steps", 1), ("sources", 1), ("padding", 0)):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, Integral) and int(value) >= least):
+                raise ValueError(f"{name} {value} must be a whole number of at least {least}")
         if not 0 < self.tolerance < math.inf:
             raise ValueError(f"tolerance {self.tolerance} must be above 0, and finite")
         if self.reference_plane is not None and not math.isfinite(self.reference_plane):

@@ -20,7 +20,7 @@ from typing import NoReturn
 from recon.cli import arguments
 from recon.cli.exit_codes import BAD_INPUT, INTERRUPTED
 from recon.cli.processes.torchrun import place, report
-from recon.report.terminal import write_plainly
+from recon.report.terminal import all_said, write_plainly
 
 
 @dataclass(frozen=True)
@@ -164,13 +164,14 @@ def main(typed: Sequence[str] | None = None) -> int:
     """Run a command.
 
     typed: the words after `torchdic`; None takes them from the command line.
-    Returns the exit code: 0, 1 for a fit that diverges or an installation that errs, 2 for bad input, 130 for an
-    interruption. Of several processes that torchrun has started, the first one's counts.
+    Returns the exit code: 0, 1 for a fit that diverges or an installation that errs, 2 for bad input and where what is
+    printed can't be written, 130 for an interruption. Of several processes that torchrun has started, the first one's
+    counts.
     """
     write_plainly()
     found = place()
     if found is None:
-        return _run(typed)
+        return _run(typed) or (0 if all_said() else BAD_INPUT)
     with interrupted_at_once():
         from recon.cli.processes.together import take_part
     return take_part(found, partial(_run, typed))

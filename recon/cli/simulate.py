@@ -104,4 +104,8 @@ def _write(config: Config, images: Tensor, out: Path) -> None:
     if config.tolerance is None:  # otherwise the plan has left it
         leave_configuration(config, out, "simulate")
     prisms, planes, ny, nx = images.shape
-    print(f"{out / STACK}: {prisms} prism settings × {planes} focus planes × {ny} × {nx} pixels")
+    counted = " × ".join(
+        f"{number} {noun}{'' if number == 1 else 's'}"
+        for number, noun in ((prisms, "prism setting"), (planes, "focus plane"))
+    )
+    print(f"{out / STACK}: {counted} × {ny} × {nx} pixels")

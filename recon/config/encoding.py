@@ -17,6 +17,9 @@ _MARKS = (
 # A number with a decimal comma, in no array: the next key of a table may follow it.
 _COMMA = re.compile(r"^[^#\n]*=\s*([+-]?\d+,\d+)\s*[,#}\n]", re.MULTILINE)
 
+# Where tomllib says that it stopped, and the quotation marks that word processors put in place of " and '.
+_PLACE, _QUOTES = re.compile(r"\(at line (\d+), column \d+\)$"), "“”„‟«»‘’‚"
+
 
 def decoded(content: bytes) -> str:
     """The text of a file: UTF-8, or what its byte-order mark says.
@@ -34,18 +37,31 @@ def decoded(content: bytes) -> str:
 
 
 def values_in(content: bytes) -> dict[str, Any]:
-    """The values of a TOML file. Raises ValueError where it is none; a decimal comma is said to be one."""
+    """The values of a TOML file. Raises ValueError where it is none, with what is usually wrong with such a line."""
     text = ""
     try:
         text = decoded(content)
         return tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError is one
-        comma = _COMMA.search(text)
-        if comma is None:
-            raise ValueError(f"is not TOML: {error}") from error
+        raise ValueError(f"is not TOML: {_usual_mistake(text, str(error)) or error}") from error
+
+
+def _usual_mistake(text: str, error: str) -> str | None:
+    """What is wrong with a text that is no TOML, in words, where it is one of the usual mistakes; else None."""
+    if (comma := _COMMA.search(text)) is not None:
         line, number = text.count("\n", 0, comma.start(1)) + 1, comma[1]
-        point = number.replace(",", ".")
-        raise ValueError(f"is not TOML: {number} in line {line} has a decimal comma: write {point}") from error
+        return f"{number} in line {line} has a decimal comma: write {number.replace(',', '.')}"
+    if (place := _PLACE.search(error)) is None:
+        return None
+    number = int(place[1])
+    line = text.split("\n")[number - 1].strip()
+    if (quote := next((sign for sign in _QUOTES if sign in line.partition("#")[0]), None)) is not None:
+        return f'line {number} has the quotation mark {quote}: write "'
+    if error.startswith(("Unescaped '\\'", "Invalid hex value")):
+        return f"line {number} has a single \\ in double quotes: write / between folders, or '…' in place of \"…\""
+    if error.startswith("Cannot overwrite"):
+        return f"line {number} says again what was said before: {line}"
+    return None
 
 
 def _undecodable(error: UnicodeDecodeError, content: bytes, encoding: str | None) -> str:

@@ -18,6 +18,7 @@ from recon.recording.masks import LeftOut, counted_pixels, left_out
 from recon.recording.preparation import ExpectedStack, Measured, Normalisation, check_counts, prepare
 from recon.recording.stuck_pixels import sharpest, stuck_pixels
 from recon.recording.support import edges_support
+from recon.recording.survey.odd_images import odd_images
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.format import Stack
@@ -111,6 +112,8 @@ def _left_out(section: DataSection, stack: Stack, ratio: float | None, empty: Em
     found = left_out(stack, mask, stuck)
     if str(found):
         print(found)
+    for line in odd_images(stack, found.counted):
+        warnings.warn(f"{stack.source}: {line}", StackWarning, stacklevel=4)
     return found
 
 

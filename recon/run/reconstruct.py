@@ -27,10 +27,10 @@ from recon.run.checkpoint import Checkpoint, CheckpointError, save_if_possible
 from recon.run.data import load_data, load_support, looks, warn_of_changes
 from recon.run.folder.lock import when_done
 from recon.run.folder.prepared import prepare_folder
-from recon.run.folder.results import check_no_results
+from recon.run.folder.results import check_inputs_stay, check_no_results
 from recon.run.misfits import misfit_for
 from recon.run.recorded import CHECKPOINT, LOG, STOPPING, descend_recorded, leave_stopped, tell_foreseen
-from recon.run.results import GO_ON, INTERRUPTED, METRICS, VOLUME, Result, ResultsError, write_results
+from recon.run.results import GO_ON, IMAGES, INTERRUPTED, LEFT, METRICS, VOLUME, Result, ResultsError, write_results
 from recon.run.room import (
     check_room_for_descent,
     check_room_for_direct,
@@ -71,6 +71,7 @@ def reconstruct(
     ShortOfMemoryError where there is no room for the descent, before `out` is touched; InterruptedRunError on Ctrl-C,
     with a checkpoint and the volume so far saved; ResultsError where results cannot be written.
     """
+    _check_inputs_stay(config, out)
     before, budget = looks(config), None if config.fidelity is None else config.fidelity.memory
     config, measured, made, problem, identity = _asked(config, device, misfit)
     start = None if restart else _checkpoint_to_resume(out, identity, resume=resume)
@@ -298,6 +299,12 @@ def _checkpoint_to_resume(out: Path, identity: str, *, resume: bool) -> Checkpoi
             else "an interrupted run; go on with --resume"
         )
         raise CheckpointError(f"{saved}: {which}, or begin anew with --restart")
-    if finished:
-        check_no_results(out, (METRICS,), restart=False)
+    check_no_results(out, (METRICS, VOLUME, IMAGES), restart=False)
     return None
+
+
+def _check_inputs_stay(config: Config, out: Path) -> None:
+    """Raise ConfigError where a result would replace a file that the configuration names."""
+    data, support = config.data, config.reconstruction.support
+    inputs = [] if data is None else [*data.files, data.mask, data.empty]
+    check_inputs_stay(out, [*inputs, None if support == "edges" else support], LEFT)

@@ -36,7 +36,8 @@ VOLUME, METRICS = "volume.ome.tif", "metrics.json"
 IMAGES = "images.ome.tif"
 # The volume of a descent that was interrupted, beside the results of one that wasn't.
 INTERRUPTED = "volume.interrupted.ome.tif"
-
+# All volumes, images and pictures that a reconstruction leaves.
+LEFT = (VOLUME, IMAGES, INTERRUPTED, "opl.ome.tif", "images.png", "sections.png", "misfit.png")
 
 # What ends a message about results that can't be written, where a run can go on.
 GO_ON = "; make room and go on with --resume"

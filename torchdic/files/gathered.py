@@ -24,6 +24,8 @@ _FEW = 3
 
 # What a file's name is made of: numbers and words.
 _PART = r"\d+|[^\W\d_]+"
+# A number with a sign or decimals, which counts no planes.
+_SIGNED = r"[-+−]\d|\d[.,]\d"
 
 # Letters before a number in a file's name, by which it counts planes or prism settings.
 _OF_PLANES = ("z", "plane", "planes", "slice", "focus", "depth", "t", "time")
@@ -203,7 +205,9 @@ def _lacking(files: Sequence[Path], places: Sequence[tuple[int, int]], prism: in
     at: dict[tuple[int, int], Path] = {}
     for file, place in zip(files, places, strict=True):
         if place in at:
-            return f"{at[place].name} and {file.name} are of one setting and plane"
+            signed = re.search(_SIGNED, file.stem) is not None
+            hint = ": signs and decimals aren't read, so name planes z1, z2, …" if signed else ""
+            return f"{at[place].name} and {file.name} are of one setting and plane{hint}"
         at[place] = file
     settings, depths = ({place[i]: file for place, file in at.items()} for i in (0, 1))
     names = [

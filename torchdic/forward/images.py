@@ -57,8 +57,8 @@ def image_field(
     grid: the transmission's pixels. The number of slices has no effect.
     microscope, acquisition, fidelity: as for `image`.
     background: index of the medium.
-    The result has the shape (prism, focus, y, x). Raises ValueError as `image` does, if a shape is not the grid's, and
-    for light of a spectrum, because the transmission would differ between its wavelengths.
+    The result has the shape (prism, focus, y, x). Raises ValueError as `image` does, if a shape is not the grid's or a
+    value not finite, and for light of a spectrum, because the transmission would differ between its wavelengths.
     """
     if microscope.spectrum is not None:
         raise ValueError(
@@ -74,6 +74,8 @@ def image_field(
     expected = (*((len(momentum),) if transmission.ndim == 3 else ()), *grid.shape[1:])
     if tuple(transmission.shape) != expected:
         raise ValueError(f"transmission has shape {tuple(transmission.shape)}, the grid and sources ask for {expected}")
+    if not bool(torch.isfinite(transmission.detach()).all()):
+        raise ValueError(f"transmission holds {int((~torch.isfinite(transmission)).sum())} values that are not finite")
     n0 = scalar(background, real)
     passage = FieldPassage(transmission, grid, n0, microscope, acquisition, fidelity)
     return shared(_image_of_field, _part_of_image_of_field, passage)

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass, replace
 
 import torch
@@ -126,6 +126,9 @@ class Acquisition:
     focus: Sequence[float | Tensor] = (0.0,)
 
     def __post_init__(self) -> None:
+        for name, value, such in (("prisms", self.prisms, "[Prism(…)]"), ("focus", self.focus, "[0.0]")):
+            if not isinstance(value, Sized):
+                raise TypeError(f"{name} {value} must be a sequence, such as {such}")
         if len(self.prisms) == 0 or len(self.focus) == 0:
             raise ValueError("an acquisition needs at least one prism (or None for bright field) and one focus plane")
         for focus in self.focus:

@@ -22,7 +22,7 @@ This has no singularity on the axis, where the directions s and p are undefined.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -59,6 +59,25 @@ class Rays:
     opd: Float[Tensor, " *ray"]
     absorbed: Float[Tensor, " *ray"] | None = None
     turn: Float[Tensor, " *ray"] | None = None
+
+    def like(self, other: Tensor) -> "Rays":
+        """The rays with the dtype and device of a tensor; gradients are kept.
+
+        Raises ValueError for vectors that aren't (y, x), and quantities of different numbers of rays.
+        """
+        held = {name: value for name, value in vars(self).items() if value is not None}
+        shapes = {name: tuple(value.shape) for name, value in held.items()}
+        for name in ("position", "momentum"):
+            if shapes[name][-1:] != (2,):
+                raise ValueError(f"{name} has shape {shapes[name]}, not (…, 2), (y, x)")
+        try:
+            torch.broadcast_shapes(
+                *(shape[:-1] if n in ("position", "momentum") else shape for n, shape in shapes.items())
+            )
+        except RuntimeError as error:
+            told = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise ValueError(f"{told} aren't of as many rays") from error
+        return replace(self, **{name: value.to(other) for name, value in held.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +125,11 @@ def trace(volume: Volume, rays: Rays, fidelity: Fidelity) -> Rays:
     rays: on the first face.
     fidelity: its solver, tolerance, steps, interpolation and memory are used.
     Their `opd` grows by W, the difference from each ray's own unperturbed plane wave (with its momentum at the start,
-    in the background). Their `turn`, if they have one, grows by τ. Raises TurnedRaysError if a ray can't go on toward
-    +z, because the index falls to its transverse momentum.
+    in the background). Their `turn`, if they have one, grows by τ. They have the dtype and device of the volume's Δn.
+    Raises TurnedRaysError if a ray can't go on toward +z, because the index falls to its transverse momentum, and
+    ValueError for shapes that don't fit together.
     """
+    rays = rays.like(volume.delta)
     change = deviation(volume.sampled(fidelity.interpolation), rays, fidelity, turn=rays.turn is not None)
     slope = rays.momentum / axial_momentum(volume.background, rays.momentum)[..., None]
     absorbed = change.absorbed

@@ -20,7 +20,8 @@ class Volume(nn.Module):
         the volume has the dtype and device of delta.
     background: index of the medium around the specimen, a number or a 0-d tensor.
     absorption: κ ≥ 0 of the complex index n + iκ, shape (z, y, x). None is a specimen that absorbs nothing.
-    Raises ValueError if a shape is not the grid's, an index is not a positive number, or κ is negative.
+    Raises TypeError for what is no tensor, and ValueError if a shape is not the grid's, a dtype is neither float32 nor
+    float64, an index is not a positive number, or κ is negative.
     """
 
     delta: Float[Tensor, "z y x"]
@@ -114,9 +115,11 @@ class SampledVolume:
 
 
 def _check_field(name: str, field: Tensor, grid: Grid) -> None:
+    if not isinstance(field, Tensor):
+        raise TypeError(f"{name} is of {type(field)}: it must be a tensor, as torch.as_tensor makes one")
     if tuple(field.shape) != grid.shape:
         raise ValueError(f"{name} has shape {tuple(field.shape)}, the grid has {grid.shape} (z, y, x)")
-    if not field.is_floating_point():
-        raise ValueError(f"{name} has dtype {field.dtype}: it must be a floating-point tensor")
+    if field.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"{name} has dtype {field.dtype}: it must be torch.float32 or torch.float64")
     if not bool(torch.isfinite(field).all()):
         raise ValueError(f"{name} holds {int((~torch.isfinite(field)).sum())} values that are not finite")

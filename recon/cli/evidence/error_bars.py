@@ -18,6 +18,7 @@ from recon.report.verdict import PoorFitWarning
 from recon.run.evidence.error_bars import DEVIATION, TOTAL, Wanted, error_bars, poor_fit
 from recon.run.evidence.kept_refits import ERROR_BARS
 from recon.run.evidence.seen import what_lacks
+from recon.run.folder.results import check_inputs_stay
 from recon.run.reconstruct import Reconstructed, reconstructed
 from torchdic.files.stack import read_stack
 
@@ -47,6 +48,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Find the error bars of a reconstruction, print them, and leave them in its folder."""
+    check_inputs_stay(options.folder, [options.regions], (DEVIATION, TOTAL))
     done = reconstructed(options.folder, options.device)
     outlines = dict(_outlines(options.regions, done)) if options.regions is not None else {}
     wanted = Wanted(options.refits, options.copies, options.increment, outlines)

@@ -20,7 +20,7 @@ from recon.recording.survey.focus import sharpest_plane
 from recon.recording.survey.survey import flattened_planes
 from recon.report import figures
 from recon.run.folder.prepared import prepare_folder
-from recon.run.folder.results import check_no_results
+from recon.run.folder.results import check_inputs_stay, check_no_results
 from torchdic.errors import StackError
 from torchdic.files.gathered import gather
 from torchdic.files.stack import write_stack
@@ -51,6 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Find the phase and leave it in the folder as phase.ome.tif, phase.png and phase.json."""
     check_no_results(options.out, (FACTS,), restart=options.restart)
+    check_inputs_stay(options.out, options.image, (PHASE, FIGURE))
     stack = gather(options.image, options.series).stack
     settings, planes, ny, nx = stack.data.shape
     _check_number("--setting", options.setting, settings)

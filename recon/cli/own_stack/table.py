@@ -9,6 +9,7 @@ import numpy as np
 from recon.cli.own_stack.settled import Settled
 from recon.cli.own_stack.template import angle_in_words, name_of_setting
 from recon.config.commented import Sourced
+from recon.recording.survey.odd_images import odd_images
 from recon.recording.survey.survey import SMALLEST, Survey, shows_edges
 from torchdic.files.gathered import Gathered
 
@@ -110,6 +111,7 @@ def _warned(gathered: Gathered, found: Survey, settled: Settled) -> Iterator[str
     if settled.na.value > medium:
         yield f"NA {settled.na.value:g} is above the medium's index {medium:g}: light beyond the index is dark"
     yield from _too_little(gathered, found)
+    yield from (f"warning: {line}" for line in odd_images(gathered.stack, prism="setting"))
     yield from _bright_extinction(gathered, settled)
     uneven, flicker = (max(getattr(s, name) for s in found.settings) for name in ("unevenness", "flicker"))
     if uneven > _UNEVEN:

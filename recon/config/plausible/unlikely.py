@@ -24,6 +24,9 @@ _WIDER = 1.05
 # Sides of a pixel, and lengths of a shear, over the resolution λ/(2 NA).
 _PIXEL, _SHEAR = (1 / 15, 4.0), 4.0
 
+# Images of nothing at all err by their own standard deviation, in whose unit a tolerance is.
+_TOLERANCE = 1.0
+
 # The greatest |Δn| of what light passes without much loss: of air against glass, with room to spare.
 _DIFFERENCE = 1.0
 
@@ -62,6 +65,11 @@ def unlikely(config: Config) -> Iterator[str]:
     yield from _light(config)
     yield from _apertures(config)
     yield from _differences(config)
+    if config.tolerance is not None and config.tolerance >= _TOLERANCE:
+        yield (
+            f"tolerance: {config.tolerance:g} is likely wrong: images of nothing meet it, for it is relative to the "
+            f"images' standard deviation; if {config.tolerance:g} % is meant, that is {config.tolerance / 100:g}"
+        )
     if config.data is not None:  # a simulation may be as fine as it likes
         yield from _sampling(config)
         yield from _slices(config)

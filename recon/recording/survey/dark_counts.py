@@ -45,7 +45,8 @@ def dark_counts(
     The noise's variance is gain·(level − offset) + read². A line through the variances (see `noise_of_level`) gives the
     gain, and the offset as the level at which only the read noise is left.
     """
-    levels, variances, blocks = variances_of_levels(images, mask)
+    lit = images.min((-2, -1)) < images.max((-2, -1))  # a frame that was dropped has one value, and no noise
+    levels, variances, blocks = variances_of_levels(images[lit], None if mask is None else mask[lit])
     if len(levels) < 4:
         return None
     (intercept, gain), error = fitted_line(np.stack([np.ones_like(levels), levels], axis=1), variances, blocks)

@@ -130,7 +130,8 @@ def flattened_planes(
     for number, image in enumerate(sound):
         if even:
             relative = image / surface
-            flat[number] = relative / np.median(relative)
+            level = float(np.median(relative))
+            flat[number] = relative / level if level > 0 else 1 + relative - level
         else:
             flat[number] = 1 + (image - np.median(image)) / spread
     return flat

@@ -12,7 +12,9 @@ from torchdic.files.whole import written_whole
 
 def check_folder(out: Path) -> None:
     """Raise ConfigError where `out` can't become a folder to write to, as where it is a file. Nothing is touched."""
-    there = next(folder for folder in (out, *out.absolute().parents) if os.path.exists(folder))
+    there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
+    if not os.path.exists(there):
+        raise ConfigError(f"{out}: can't be written to: {there} is a link to {os.readlink(there)}, which isn't there")
     if not there.is_dir():
         raise ConfigError(f"{out}: can't be written to: {there} is a file, not a folder")
     if not os.access(there, os.W_OK | os.X_OK):
