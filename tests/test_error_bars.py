@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 from small_bead import CONFIG
 
 from recon.cli import main
-from recon.evidence.bars import SPECIMEN, bars_of
+from recon.cli.evidence.error_bars import _words
+from recon.evidence.bars import SPECIMEN, ErrorBars, bars_of
+from recon.evidence.ends import ends, open_ends
 from recon.evidence.error_bars import error_bars
 from recon.evidence.errors import ErrorModel, near, noise_deviation, noise_interval
 from recon.evidence.estimate import Estimate
@@ -317,6 +319,43 @@ def test_bars_of_an_empty_volume_are_nothing():
     assert not found.total.any()
     assert found.typical(found.total) == 0.0
     assert all(known.value == known.error == 0.0 for known in found.regions[SPECIMEN][1].values())
+
+
+# where a specimen ends
+
+
+def test_a_specimen_ends_where_the_end_slices_hold_little_of_the_fullest():
+    delta = torch.zeros(5, 4, 4)
+    assert ends(delta) == (0.0, 0.0)
+    delta[1:4, 1:3, 1:3] = torch.tensor([0.01, -0.02, 0.01])[:, None, None]
+    delta[0, 1, 1] = 0.004
+    assert ends(delta) == (pytest.approx(0.05), 0.0)
+    assert open_ends(*ends(delta)) is None
+    assert ends(delta[:2]) == (0.0, 0.0)  # no slice lies between
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "words"),
+    [
+        (0.333, 0.49, "its first and last slices hold 33% and 49% of what the fullest does"),
+        (0.0, 1.0, "its last slice holds 100% of what the fullest does"),
+        (0.151, 0.149, "its first slice holds 15% of what the fullest does"),
+    ],
+)
+def test_a_specimen_that_goes_on_is_told(first, last, words):
+    assert open_ends(first, last) == words
+
+
+def test_bars_of_a_specimen_that_goes_on_do_not_claim_to_hold():
+    delta = torch.zeros(6, 8, 8)
+    delta[:, 2:6, 2:6] = 0.02
+    zeros = torch.zeros_like(delta)
+    ends_within = delta.clone()
+    ends_within[[0, -1]] = 0
+    said = [list(_words(ErrorBars(GRID, d, zeros, zeros, 0.9, {}), 1.4))[-1] for d in (delta, ends_within)]
+    assert said[0].startswith("the volume doesn't end within its depth: its first and last slices hold 100% and 100%")
+    assert "two of three" not in said[0]
+    assert said[1].startswith("the bars hold two of three voxels")
 
 
 # in Python

@@ -262,6 +262,21 @@ def test_without_a_cause_what_is_assumed_is_to_be_checked_first():
     assert "check what is assumed (bias), then pixel size" in Verdict(0.5, 0.13, 1.0, assumed=("bias",)).words
 
 
+def test_a_specimen_that_goes_on_beyond_the_depth_is_told(images, data, truth):
+    """The apertures see little of where it ends, so that it may end beyond the last slice, and anywhere there."""
+    rows = [(n, 0.5, 0.5, 1.0) for n in range(20)]
+    found = judged(problem_of(data), images, [NOISE] * 2, "newton", rows)
+    within = truth.clone()
+    within[[0, -1]] = 0
+    assert "depth" not in found.with_volume(within).words
+    within[-1] = truth[truth.shape[0] // 2]
+    beyond = found.with_volume(within)
+    words = "the volume explains the stack; it doesn't end within its depth (its last slice holds 100% of what the"
+    assert words in beyond.words
+    assert beyond.words.endswith("isn't told: fit it with more slices (volume.shape)")
+    assert beyond.as_json()["ends"] == [0.0, pytest.approx(1.0)]
+
+
 def test_a_volume_that_is_full_of_the_other_sign_is_told(images, data, truth):
     """The ball less its own Δn everywhere gives the same images: a specimen above the medium, bounds below it."""
     rows = [(n, 0.5, 0.5, 1.0) for n in range(20)]

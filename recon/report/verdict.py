@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from recon.calibration.trials.short_fits import can_be_tried
+from recon.evidence.ends import MORE_SLICES, ends, open_ends
 from recon.fit.bounds import Bounds
 from recon.fit.problem import DIRECT, Problem
 from recon.fit.step import Row
@@ -62,7 +63,8 @@ class Verdict:
     `recon.prior.weight.whiteness`; 1 is white. causes: what may be wrong, the likeliest first; empty where the volume
     explains the stack. free: whether the bounds leave the sign of Δn free. expected: whether the method's images are
     expected to come down to the noise. assumed: what nobody has said, by the names of a configuration's `assumed`.
-    filled: the median of Δn where most of the volume isn't the medium; else None.
+    filled: the median of Δn where most of the volume isn't the medium; else None. ends: of the volume, see
+    `recon.evidence.ends`.
     """
 
     misfit: float
@@ -73,6 +75,7 @@ class Verdict:
     expected: bool = True
     assumed: tuple[str, ...] = ()
     filled: float | None = None
+    ends: tuple[float, float] = (0.0, 0.0)
 
     @property
     def ratio(self) -> float | None:
@@ -102,9 +105,10 @@ class Verdict:
         return self.poor and (self.misfit > 1 or (self.expected and not unfinished))
 
     def with_volume(self, delta: Float[Tensor, "z y x"]) -> "Verdict":
-        """The verdict with what the volume itself says: whether most of it isn't the medium."""
+        """The verdict with what the volume itself says: whether most of it isn't the medium, and where it ends."""
         median = float(delta.median())
-        return replace(self, filled=median if abs(median) > FILLED * float(delta.abs().max()) else None)
+        filled = median if abs(median) > FILLED * float(delta.abs().max()) else None
+        return replace(self, filled=filled, ends=ends(delta))
 
     @property
     def words(self) -> str:
@@ -131,7 +135,7 @@ class Verdict:
             return f"the volume follows the noise, and another explains the stack better; {self._likeliest()}"
         if self.poor:
             return f"{1 - self.explained:.0%} of the contrast is unexplained, residual {residual}; {self._likeliest()}"
-        free = self._gauge() + self._offset()
+        free = self._gauge() + (self._offset() or self._depth())
         if self.ratio is not None and self.noise and self.noise >= LEAST and self.ratio < FOLLOWS:
             return f"the volume follows the noise; raise reconstruction.tv, or leave it 'auto'{free}"
         if self.noise is None:
@@ -157,6 +161,13 @@ class Verdict:
             "if that is the medium, Δn has the other sign (reconstruction.bounds)"
         )
 
+    def _depth(self) -> str:
+        """That the specimen goes on beyond the volume's first or last slice, where it does."""
+        beyond = open_ends(*self.ends)
+        if beyond is None:
+            return ""
+        return f"; it doesn't end within its depth ({beyond}), and how far it goes on isn't told: {MORE_SLICES}"
+
     def _likeliest(self) -> str:
         if not self.causes:
             checked = ", ".join(self.assumed)
@@ -175,6 +186,7 @@ class Verdict:
             "ratio": self.ratio,
             "white": self.white,
             "explained": self.explained,
+            "ends": list(self.ends),
             "poor": self.poor,
             "causes": [asdict(cause) for cause in self.causes],
             "words": self.words,

@@ -13,6 +13,7 @@ from torch import Tensor
 from recon.cli.arguments import decimal
 from recon.config.schema import ConfigError
 from recon.evidence.bars import ErrorBars
+from recon.evidence.ends import MORE_SLICES, ends, open_ends
 from recon.evidence.regions import INCREMENT, Known
 from recon.report.verdict import PoorFitWarning
 from recon.run.evidence.error_bars import DEVIATION, TOTAL, Wanted, error_bars, poor_fit
@@ -99,7 +100,14 @@ def _words(found: ErrorBars, background: float) -> Iterator[str]:
         yield f"  mean index  {background + mean.value:.5f} ± {mean.error:.2g} ({background + mean.found:.5f})"
         yield f"  dry mass    {_told(mass)} pg more than its medium ({mass.found:.4g})".replace("-", "−")
     yield "numbers are corrected for what turned copies lose of theirs; in brackets, as they are in the volume"
-    yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
+    beyond = open_ends(*ends(found.delta))
+    if beyond is None:
+        yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
+        return
+    yield (
+        f"the volume doesn't end within its depth: {beyond}, and turned copies fill it likewise. How far the specimen "
+        f"really goes on is in no bar, and volume and mean index hang on it: {MORE_SLICES}"
+    )
 
 
 def _beyond(threshold: float) -> str:

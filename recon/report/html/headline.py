@@ -4,10 +4,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from recon.evidence.ends import open_ends
 from recon.report.html.folder import Folder, table_in, tables_in
 from recon.report.html.images import Images
 from recon.report.html.volumes import Volumes
-from recon.report.html.words import duration, percent, short, sure, times
+from recon.report.html.words import duration, is_number, percent, short, sure, times
 from recon.report.verdict import FOLLOWS, LEAST
 
 RECONSTRUCTION = "Reconstruction"
@@ -76,7 +77,7 @@ def headline(kind: tuple[str, str], metrics: dict[str, Any]) -> Headline:
         advice = () if causes else others
         further = [first, measured, *advice, lacks]
         return Headline("poor", "The volume does not explain the images", _sentences(further), causes)
-    state = "open" if _follows_noise(metrics, verdict) else "good"
+    state = "open" if _follows_noise(metrics, verdict) or _goes_on(verdict) else "good"
     return Headline(state, _sentence(first), _sentences([measured, *others, lacks]))
 
 
@@ -140,6 +141,12 @@ def _follows_noise(metrics: dict[str, Any], verdict: dict[str, Any]) -> bool:
     """Whether the volume follows the noise, so that there is something to do although it explains the images."""
     noise, ratio = metrics.get("noise_misfit"), verdict.get("ratio")
     return bool(noise and noise >= LEAST and ratio is not None and ratio < FOLLOWS)
+
+
+def _goes_on(verdict: dict[str, Any]) -> bool:
+    """Whether the specimen doesn't end within the volume's depth. Verdicts of earlier versions don't tell."""
+    found = verdict.get("ends")
+    return isinstance(found, list) and len(found) == 2 and all(map(is_number, found)) and open_ends(*found) is not None
 
 
 def _causes(verdict: dict[str, Any]) -> Iterator[tuple[str, str, str]]:

@@ -13,6 +13,7 @@ from torch import Tensor
 from recon.coverage.seen import Coverage
 from recon.earlier.direct import solved_directly
 from recon.evidence.bars import ErrorBars, bars_of
+from recon.evidence.ends import ends
 from recon.evidence.estimate import Estimate
 from recon.evidence.refits import COPIES, NOISY, Kind, Refit, copy, planned_refits, refits
 from recon.evidence.regions import INCREMENT, as_json
@@ -153,6 +154,7 @@ def _leave(found: ErrorBars, seen: Coverage | None, done: Reconstructed, wanted:
             "whole": found.typical(found.total),
         },
         "noise_interval": found.interval,
+        "ends": list(ends(found.delta)),
         "seen_share": None if seen is None else seen.share,
         "regions": as_json(found.regions, done.config.volume.background),
     }
