@@ -432,14 +432,15 @@ def test_floats_are_scaled_by_their_background(tmp_path, recording):
     ("planes", "step", "depth", "pixel", "expected"),
     [
         (1, 0.5, 0.9, 0.1, (1, 0.9)),
-        (11, 0.3, 0.9, 0.1, (13, 0.3)),  # the step serves, between a quarter and half the depth of field
+        (11, 0.3, 0.9, 0.1, (20, 0.3)),  # the step serves, between a quarter and half the depth of field
         (11, 0.1, 0.9, 0.1, (5, 0.45)),  # a finer step doesn't ask for finer slices
-        (11, 1.0, 0.9, 0.1, (25, 0.45)),  # nor a coarser one for coarser slices
+        (11, 1.0, 0.9, 0.1, (31, 0.45)),  # nor a coarser one for coarser slices
         (5, 2.0, 8.0, 0.4, (16, 1.0)),  # no thicker than 1 µm
-        (11, 0.2, 0.2, 0.15, (15, 0.15)),  # no thinner than a pixel
+        (11, 0.2, 0.2, 0.15, (19, 0.15)),  # no thinner than a pixel
+        (3, 0.5, 2.0, 0.1, (6, 0.5)),  # half a depth of field beyond planes that span little
     ],
 )
-def test_slices_fill_the_focus_range_and_a_depth_of_field(planes, step, depth, pixel, expected):
+def test_slices_fill_the_focus_range_and_go_on_beyond_it(planes, step, depth, pixel, expected):
     number, thickness = slices_of(planes, step, depth, pixel)
     assert (number, thickness) == (expected[0], pytest.approx(expected[1]))
     if planes > 1:

@@ -100,8 +100,9 @@ def slices_of(planes: int, step: float, depth: float, pixel: float) -> tuple[int
     planes, step: of the focus; depth: of field, λn/NA²; pixel: all in µm.
 
     A slice is half the depth of field, which axial detail needs, or the focus step where that is between a quarter and
-    half of it; no thinner than a pixel and no thicker than 1 µm. The slices fill what the planes span and a depth of
-    field. One plane has one slice.
+    half of it; no thinner than a pixel and no thicker than 1 µm. The slices fill what the planes span, and go on beyond
+    it on either side, as fits draw specimens out along z: by two depths of field, but no further than half of what the
+    planes span, and by half a depth of field at least. One plane has one slice.
     """
     if planes == 1:
         return 1, round(min(depth, _THICKEST), 3)
@@ -111,7 +112,9 @@ def slices_of(planes: int, step: float, depth: float, pixel: float) -> tuple[int
     thickness = max(min(thickness, _THICKEST), pixel)
     if thickness != step:
         thickness = round(thickness, 3)
-    return max(math.ceil(((planes - 1) * step + depth) / thickness - 1e-9), 1), thickness
+    span = (planes - 1) * step
+    beyond = max(min(2 * depth, span / 2), depth / 2)
+    return max(math.ceil((span + 2 * beyond) / thickness - 1e-9), 1), thickness
 
 
 def _offset(stack: Stack, camera: DarkCounts | None, given: float | None) -> Sourced | None:

@@ -86,7 +86,7 @@ def _microscope(settled: Settled) -> list[Line]:
 def _volume(gathered: Gathered, settled: Settled) -> list[Line]:
     _, planes, height, width = gathered.stack.data.shape
     number, thickness = settled.slices
-    why = "one plane shows no depth" if planes == 1 else "they fill the focus range and a depth of field"
+    why = "one plane shows no depth" if planes == 1 else "they fill the focus range and go on beyond it"
     if planes > 1 and thickness == settled.step.value:
         size = "the focus step"
     else:
