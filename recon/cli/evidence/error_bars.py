@@ -102,7 +102,7 @@ def _words(found: ErrorBars, background: float) -> Iterator[str]:
     yield "numbers are corrected for what turned copies lose of theirs; in brackets, as they are in the volume"
     beyond = open_ends(*ends(found.delta))
     if beyond is None:
-        yield "the bars hold two of three voxels of such a specimen; what the images don't show at all is in no bar"
+        yield "the bars hold two of three voxels of turned copies of it; what the images don't show at all is in no bar"
         return
     yield (
         f"the volume doesn't end within its depth: {beyond}, and turned copies fill it likewise. How far the specimen "
