@@ -41,7 +41,7 @@ class Microscope:
     reduces the contrast by the factor 2J1(a)/a with a = 2π|s|NA_c/λ.
 
     Raises ValueError for a wavelength that isn't positive or lies outside the spectrum, and for Zernike terms of the
-    polarisation's pupil without an objective.
+    polarisation's pupil without an objective; TypeError for a part that is no such part, as a bare aperture is none.
     """
 
     wavelength: float
@@ -53,6 +53,13 @@ class Microscope:
     condenser_prism: bool = True
 
     def __post_init__(self) -> None:
+        for name, value, kind in (
+            ("objective", self.objective, Objective),
+            ("condenser", self.condenser, Condenser),
+            ("camera", self.camera, Camera),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(f"{name} {value} must be {kind.__name__}(…) or None")
         if not (0 < self.wavelength < float("inf")):
             raise ValueError(f"wavelength {self.wavelength} µm must be above 0")
         if self.spectrum is not None:
