@@ -482,7 +482,7 @@ def test_an_interrupted_command_keeps_what_it_has_measured(run, tmp_path, monkey
         ('dtype = "float64"', 'dtype = "float16"', "candidates[1]: dtype 'float16' must be one of"),
         ('dtype = "float64"', "digits = 3", "unknown key candidates[1].digits"),
         ("repeats = 1", "repeats = 0", "work_precision: repeats 0 must be at least 1"),
-        ("sources = 2 }", "sources = 0 }", "candidates[0].fidelity: sources 0 must be at least 1"),
+        ("sources = 2 }", "sources = 0 }", "candidates[0].fidelity: sources 0 must be a whole number of at least 1"),
         (
             "radius = 0.6",
             "radius = 0.6\nbackground = 1.4",
