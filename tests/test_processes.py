@@ -5,13 +5,13 @@ import multiprocessing
 import os
 import re
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 
 import pytest
 import tifffile
+from popen import python
 from several_ranks import forked
 from small_bead import CONFIG
 
@@ -38,17 +38,9 @@ def apart(folder, name, one="one", several="several"):
     return abs(a - b).max() / abs(a).max()
 
 
-def started(*words):
+def begun(*words):
     """A command as a shell starts it, in a group of processes of its own."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.Popen(
-        [sys.executable, "-m", "recon", *words],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
+    return python("-m", "recon", *words, start_new_session=True)
 
 
 def others(run):
@@ -159,7 +151,7 @@ def numbers(found):
 @pytest.mark.skipif(not os.path.exists("/proc/self/cmdline"), reason="processes are found by Linux's /proc")
 @pytest.mark.parametrize("whom", ["the first", "another"])
 def test_a_process_that_is_killed_ends_all_and_refits_go_on(bead, whom):
-    run = started("error-bars", "one", "--processes", "2")
+    run = begun("error-bars", "one", "--processes", "2")
     wait_until(lambda: list(bead.glob("one/refits/*")) or run.poll() is not None)
     (other,) = others(run)
     os.kill(run.pid if whom == "the first" else other, signal.SIGKILL)
@@ -175,7 +167,7 @@ def test_a_process_that_is_killed_ends_all_and_refits_go_on(bead, whom):
 @pytest.mark.skipif(not os.path.exists("/proc/self/cmdline"), reason="processes are found by Linux's /proc")
 @pytest.mark.parametrize("moment", ["at once", "within a refit"])
 def test_an_interrupt_from_the_terminal_ends_all_in_one_line(bead, moment):
-    run = started("error-bars", "one", "--processes", "2")
+    run = begun("error-bars", "one", "--processes", "2")
     if moment == "within a refit":
         wait_until(lambda: list(bead.glob("one/refits/*")) or run.poll() is not None)
     else:

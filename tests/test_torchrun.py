@@ -2,12 +2,11 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
 import tifffile
+from popen import python
 from small_bead import CONFIG
 from test_tiles import CONFIG as TILES
 
@@ -37,13 +36,9 @@ def bead(tmp_path, monkeypatch, no_pictures):
     return tmp_path
 
 
-def started(*options, number):
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(number), *options]
-    words = ["-m", "recon", "reconstruct", "run.toml", "--out", "several", "--resume"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.Popen(
-        [*command, *words], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+def run_by(number, *options):
+    torchrun = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(number), *options)
+    return python(*torchrun, "-m", "recon", "reconstruct", "run.toml", "--out", "several", "--resume")
 
 
 def wait_for_steps(run, folder):
@@ -73,7 +68,7 @@ def as_by_one(folder):
 
 @pytest.mark.parametrize("number", [2, 4])
 def test_processes_find_the_volume_of_one(number, bead):
-    run = started(number=number)
+    run = run_by(number)
     printed = run.communicate()[0]
     assert run.returncode == 0, printed
     assert printed.count("several/volume.ome.tif: ") == 1
@@ -86,7 +81,7 @@ def test_tiles_that_processes_share_out_make_the_volume_of_one(tmp_path, monkeyp
     (tmp_path / "run.toml").write_text(IN_TILES)
     assert main(["simulate", "run.toml", "--out", "made"]) == 0
     assert main(["reconstruct", "run.toml", "--out", "one"]) == 0
-    run = started(number=2)
+    run = run_by(2)
     printed = run.communicate()[0]
     assert run.returncode == 0, printed
     assert printed.count("4 tiles of ") == 1
@@ -97,7 +92,7 @@ def test_tiles_that_processes_share_out_make_the_volume_of_one(tmp_path, monkeyp
 @LINUX
 @pytest.mark.parametrize("rank", [0, 1])
 def test_a_killed_process_ends_the_run_in_one_line_and_the_checkpoint_serves(rank, bead):
-    run = started(number=2)
+    run = run_by(2)
     kill_one(run, bead, rank)
     printed = run.communicate()[0]
     assert run.returncode != 0
@@ -110,7 +105,7 @@ def test_a_killed_process_ends_the_run_in_one_line_and_the_checkpoint_serves(ran
 
 
 def test_a_run_that_is_asked_to_end_leaves_a_checkpoint(bead):
-    run = started(number=2)
+    run = run_by(2)
     wait_for_steps(run, bead)
     run.terminate()
     printed = run.communicate()[0]
@@ -123,7 +118,7 @@ def test_a_run_that_is_asked_to_end_leaves_a_checkpoint(bead):
 @LINUX
 @pytest.mark.parametrize("rank", [0, 1])
 def test_torchrun_starts_a_run_again_that_goes_on(rank, bead):
-    run = started("--max-restarts", "1", number=2)
+    run = run_by(2, "--max-restarts", "1")
     kill_one(run, bead, rank)
     printed = run.communicate()[0]
     assert run.returncode == 0, printed

@@ -106,7 +106,7 @@ def find_orders(declared: Acquisition, problem_of: ProblemOf, recipe: Recipe, no
         race.run([other for other in every if other.mistakes > LIKELY], 1, recipe)
     for number in range(2, len(ROUNDS) + 1):
         racing = race.best(ROUNDS[number - 1].most)
-        recipe = _held(recipe, _fitted((race.problem(racing[0], number, recipe), ROUNDS[number - 1])).weight)
+        recipe = _held(recipe, _fitted(race.asked(racing[0], number, recipe)).weight)
         race.run(racing, number, recipe)
     ranked = sorted(race.tried.values(), key=lambda tried: (-tried.rounds, tried.loss))
     return _chosen(tuple(ranked), race.alone, race.pixels)
@@ -125,18 +125,18 @@ class _Race:
 
     def run(self, racing: Sequence[Otherwise], number: int, recipe: Recipe) -> None:
         """Fit each description as a round asks for."""
-        problems = [self.problem(other, number, recipe) for other in racing]
-        fits = each(_fitted, [(problem, ROUNDS[number - 1]) for problem in problems])
+        fits = each(_fitted, (self.asked(other, number, recipe) for other in racing))
         with tqdm(desc=f"signs and orders, round {number} of {len(ROUNDS)}", unit="fit", total=len(racing)) as bar:
             for other, fit in zip(racing, fits, strict=True):
                 self.tried[_key(other)] = Tried(other, fit.misfit, fit.misfit if number == 1 else fit.loss, number)
                 bar.update()
 
-    def problem(self, other: Otherwise, number: int, recipe: Recipe) -> Problem:
-        """A description's short fit in a round."""
-        problem = self._problem_of(other.acquisition, ROUNDS[number - 1].slices, recipe)
+    def asked(self, other: Otherwise, number: int, recipe: Recipe) -> tuple[Problem, Round]:
+        """A description's short fit in a round, as `_fitted` takes it."""
+        this = ROUNDS[number - 1]
+        problem = self._problem_of(other.acquisition, this.slices, recipe)
         self.alone, self.pixels = problem.misfit.of_noise(self._noise) or 0.0, int(problem.misfit.pixels.sum())
-        return problem
+        return problem, this
 
     def best(self, most: int) -> list[Otherwise]:
         """The best so many of the last round, and the declared one, with which the others are compared."""

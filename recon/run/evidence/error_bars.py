@@ -36,7 +36,7 @@ from torchdic import ShortOfMemoryError
 from torchdic.errors import StackError
 from torchdic.files.stack import write_volume
 from torchdic.files.whole import write_json
-from torchdic.ranks.group import ranks_here
+from torchdic.ranks.group import ranks, ranks_here
 
 DEVIATION, TOTAL = "sd.ome.tif", "error.ome.tif"
 
@@ -99,7 +99,7 @@ def poor_fit(out: Path) -> str | None:
 
 def _at_once(done: Reconstructed) -> bool:
     """Whether each of several processes fits by itself: where there is room for all of these fits."""
-    if done.config.reconstruction.method in DIRECT:
+    if ranks() == 1 or done.config.reconstruction.method in DIRECT:
         return False
     try:
         check_room_for_descent(done.problem, GaussianMisfit, at_once=ranks_here())
