@@ -29,6 +29,7 @@ from recon.config.reading import load
 from recon.config.schema import UnlikelyWarning
 from recon.recording.survey.direction import ShearDirection
 from recon.recording.survey.survey import SettingSurvey, Survey
+from recon.run.data import load_data
 from torchdic import Acquisition, Camera, Condenser, Grid, Microscope, Objective, Prism
 from torchdic.files.described.setup import StatedSetup
 from torchdic.files.format import Stack
@@ -420,12 +421,17 @@ def test_a_folder_of_nothing_is_one_line(tmp_path, capsys):
     assert "empty: is empty; a folder of planes has files that end in .tif," in line
 
 
-def test_floats_are_scaled_by_their_background(tmp_path, recording):
-    write_stack(tmp_path / "f.tif", recording.data.astype(np.float32) / 900, (0.15, 0.15), 0.4)
-    assert new(tmp_path / "f.tif", "--out", tmp_path / "run.toml") == 0
-    config = load(tmp_path / "run.toml")
-    assert config.data is not None
-    assert config.data.scale == "background"
+def test_floats_are_flattened_and_scaled_as_the_same_counts_are(tmp_path, recording):
+    measured = []
+    for name, data in (("counts", recording.data), ("floats", recording.data.astype(np.float32))):
+        write_stack(tmp_path / f"{name}.tif", data, (0.15, 0.15), 0.4)
+        assert new(tmp_path / f"{name}.tif", "--offset", 60, "--out", tmp_path / f"{name}.toml") == 0
+        config = load(tmp_path / f"{name}.toml")
+        assert config.data is not None
+        assert "lamp" in config.reconstruction.learn
+        measured.append(load_data(config).data)
+    counts, floats = measured
+    assert np.abs(floats - counts).max() < 1e-6  # float32's rounding
 
 
 @pytest.mark.parametrize(

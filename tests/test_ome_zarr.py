@@ -3,6 +3,7 @@
 import json
 import sys
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,13 +69,15 @@ def test_sizes_that_are_not_known_stay_unknown(tmp_path, suffix):
 
 
 @SUFFIXES
-def test_a_volume_comes_back_and_replaces_an_earlier_one(tmp_path, suffix):
-    path, delta = tmp_path / f"volume{suffix}", torch.rand(GRID.shape)
-    write_volume(path, torch.zeros(GRID.shape), GRID)
-    write_volume(path, delta, GRID)
+@pytest.mark.parametrize("slices", [1, 3])
+def test_a_volume_comes_back_and_replaces_an_earlier_one(tmp_path, suffix, slices):
+    given = replace(GRID, shape=(slices, 5, 7))
+    path, delta = tmp_path / f"volume{suffix}", torch.rand(given.shape)
+    write_volume(path, torch.zeros(given.shape), given)
+    write_volume(path, delta, given)
     found, grid = read_volume(path)
     assert torch.equal(found, delta)
-    assert grid == GRID
+    assert grid == given
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
@@ -92,6 +95,12 @@ def test_what_is_written_is_what_the_specification_asks_for(tmp_path, suffix, ve
     found = models.Image.from_zarr(zarr.open_group(str(tmp_path / f"stack{suffix}"), mode="r")).attributes
     said = found if version == "v04" else found.ome
     assert [axis.unit for axis in said.multiscales[0].axes] == [None] * 4
+
+
+def test_numbers_of_another_byte_order_are_the_machines_own(tmp_path):
+    data = counts(2, 3, 5, 7)
+    path = by_hand(tmp_path / "s.zarr", data.astype(">u2"), axes_of("czyx"), [1.0, 0.5, 0.2, 0.1])
+    assert torch.equal(torch.from_numpy(read_stack(path).data), torch.from_numpy(data))
 
 
 @SUFFIXES

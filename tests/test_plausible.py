@@ -96,6 +96,7 @@ def test_what_microscopists_use_is_neither_refused_nor_warned_of(changes):
     [
         ({"volume__background": 2.4}, "volume.background: 2.4 is likely wrong"),
         ({"tolerance": 5.0}, "if 5 % is meant, that is 0.05"),
+        ({"fidelity": {"memory": 3}}, "fidelity.memory: 3 bytes is likely wrong"),
         ({"microscope__wavelength": 1.3, "volume__background": 4.8, "calibration": {}}, "volume.background: 4.8"),
         ({"microscope__wavelength": 5.46}, "microscope.wavelength: 5.46 µm is likely wrong"),
         ({"microscope__objective": {"na": 0.08}, "microscope__condenser": {"na": 0.05}}, "objective.na: 0.08"),

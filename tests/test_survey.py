@@ -241,6 +241,31 @@ def test_copies_of_an_image_are_named():
     assert list(odd_images(Stack(data.astype(np.float32), source="a.tif"))) == []  # of a model, which has no noise
 
 
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_parts_in_which_nothing_is_recorded_are_named(dtype):
+    """As a program leaves them at the sides of images that it has shifted, and Zarr where a chunk is missing."""
+    data = counts().astype(dtype)
+    data[0, 1, :, :1] = data[1, 3, 8:16, 8:16] = 0
+    (line,) = odd_images(Stack(data, source="a.tif"), prism="setting")
+    following = int(data[0, 1, :, 1:].min())
+    assert line.startswith(
+        f"setting 1, plane 2: 24 neighbouring pixels are 0, and none is between that and {following}, "
+    )
+    assert "and 1 further images have such parts: nothing is recorded there" in line
+    assert list(odd_images(Stack(data, source="a.tif"), data > 0)) == []
+
+
+def test_dark_pixels_are_not_taken_for_parts_without_a_record():
+    """Few dead ones; light that is dark here and there; a dark edge of a model without noise."""
+    data = counts()
+    data[..., ::8, ::8] = 0
+    dim = np.random.default_rng(4).poisson(np.linspace(0, 8, 24) ** 2 * np.ones((2, 4, 24, 1))).astype(np.uint16)
+    model = np.full((1, 2, 24, 24), 0.5, np.float32)
+    model[..., :4], model[..., 20:] = 0.1, 0.9
+    for images in (data, dim, model):
+        assert list(odd_images(Stack(images, source="a.tif"))) == []
+
+
 def test_clipped_pixels_are_named_where_no_bit_depth_tells_of_them():
     """Those at the camera's full scale are left out, and counted, elsewhere."""
     data = counts()

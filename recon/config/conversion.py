@@ -110,8 +110,26 @@ def _optional(value: Any, kind: Any) -> Any:
 
 
 def _or(word: str, hook: Hook) -> Hook:
-    """A hook for a word, or for what another hook converts."""
-    return lambda value, kind: value if value == word else hook(value, kind)
+    """A hook for a word, or for what another hook converts; a value that is neither is told both."""
+
+    def either(value: Any, kind: Any) -> Any:
+        if value == word:
+            return value
+        try:
+            return hook(value, kind)
+        except (TypeError, ValueError) as error:
+            if repr(word) in str(error):
+                raise
+            raise type(error)(f"{error}, or {word!r}") from error
+
+    return either
+
+
+def _or_none(value: Any, _: Any) -> Any:
+    """A whole number, or None by its word."""
+    if value is None or value == NONE:
+        return None
+    return _strict(int, (int,), f"a whole number, {NONE!r}")(value, int)
 
 
 # --- from TOML: arrays ------------------------------------------------------------------------------------------------
@@ -247,9 +265,9 @@ FIELDS: dict[type, dict[str, Hook]] = {
     ReconstructionSection: {
         "tv": _or("auto", _weights),
         "learn": _array_of(_string),
-        "draft_sources": _or("auto", lambda value, _: _optional(value, int | None)),
+        "draft_sources": _or("auto", _or_none),
         "margin": _or("auto", _whole_number),
-        "tiles": _or("auto", lambda value, _: _optional(value, int | None)),
+        "tiles": _or("auto", _or_none),
     },
     CalibrationSection: {"aberrations": _array_of(_whole_number)},
     WorkPrecisionSection: {

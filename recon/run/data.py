@@ -21,7 +21,7 @@ from recon.recording.support import edges_support
 from recon.recording.survey.odd_images import odd_images
 from torchdic import Acquisition, Fidelity, Grid, Volume, image
 from torchdic.errors import StackError, StackWarning
-from torchdic.files.format import Stack
+from torchdic.files.format import Stack, shape_text
 from torchdic.files.joined import read_joined
 from torchdic.files.stack import read_stack
 from torchdic.memory.free import check_room, free_bytes
@@ -104,7 +104,7 @@ def _left_out(section: DataSection, stack: Stack, ratio: float | None, empty: Em
 
     ratio: how far a pixel may stand out of its neighbours; None looks for no stuck pixels. empty: has bad pixels too.
     """
-    mask = None if section.mask is None else read_stack(section.mask).data != 0
+    mask = None if section.mask is None else _mask(section.mask, stack)
     stuck = None if empty is None else empty.bad
     if ratio is not None:
         own = stuck_pixels(stack.data, ratio, counted_pixels(stack, mask, stuck))
@@ -115,6 +115,19 @@ def _left_out(section: DataSection, stack: Stack, ratio: float | None, empty: Em
     for line in odd_images(stack, found.counted):
         warnings.warn(f"{stack.source}: {line}", StackWarning, stacklevel=4)
     return found
+
+
+def _mask(path: str, stack: Stack) -> np.ndarray:
+    """The user's mask of a stack, True where a pixel counts. Raises StackError where it doesn't fit the images."""
+    mask = read_stack(path).data != 0
+    try:
+        np.broadcast_to(mask, stack.data.shape)
+    except ValueError as error:
+        raise StackError(
+            f"data.mask: {path} has {shape_text(mask.shape)} (prism, focus, y, x), the images of {stack.source} "
+            f"{shape_text(stack.data.shape)}; it may have 1 prism and 1 plane for all"
+        ) from error
+    return mask
 
 
 def load_support(config: Config, measured: Measured) -> Tensor | None:

@@ -127,7 +127,7 @@ def read_volume(path: str | os.PathLike[str]) -> tuple[Float[Tensor, "z y x"], G
     if len(stack.data) != 1:
         raise StackError(f"{path}: holds {len(stack.data)} channels, a volume has one")
     if stack.pixel_size is None or not stack.focus_step:
-        raise StackError(f"{path}: has no voxel size; a volume needs PhysicalSizeX, Y and Z above 0")
+        raise StackError(f"{path}: has no voxel size; a volume says how long a voxel is along x, y and z")
     delta = torch.from_numpy(stack.data[0].astype(np.float32))
     nz, ny, nx = delta.shape
     return delta, Grid(shape=(nz, ny, nx), spacing=(stack.focus_step, *stack.pixel_size))

@@ -108,6 +108,7 @@ def _data(gathered: Gathered, found: Survey, settled: Settled, path: str, series
         lines.append(_line("offset", settled.offset))
     if not stack.is_integer:
         lines.append(Line("scale", "background", "chosen: floats, whose empty field is taken as the model's"))
+        lines.append(Line("flatten", True, "chosen: the lamp's light is divided out, as of counts"))
         return lines
     if camera is not None:
         sure = f"measured: ± {camera.gain_error / camera.gain:.0%}, counts per electron"
@@ -123,11 +124,8 @@ def _reconstruction(gathered: Gathered, settled: Settled) -> list[Line]:
     learned: dict[str, str] = {}
     if gathered.stack.data.shape[1] > 1:
         learned["drift"] = "a slow drift can't be told from a change of focus beforehand"
-    if gathered.stack.is_integer:
-        learned["lamp"] = "the background that is divided out is fitted around the specimen"
-    if learned:
-        lines.append(Line("learn", list(learned), f"chosen: {', and '.join(learned.values())}"))
-    return lines
+    learned["lamp"] = "the background that is divided out is fitted around the specimen"
+    return [*lines, Line("learn", list(learned), f"chosen: {', and '.join(learned.values())}")]
 
 
 def angle_in_words(degrees: float) -> str:

@@ -27,6 +27,9 @@ _PIXEL, _SHEAR = (1 / 15, 4.0), 4.0
 # Images of nothing at all err by their own standard deviation, in whose unit a tolerance is.
 _TOLERANCE = 1.0
 
+# Bytes in which not even a small image has room.
+_LEAST_MEMORY = 1 << 16
+
 # The greatest |Δn| of what light passes without much loss: of air against glass, with room to spare.
 _DIFFERENCE = 1.0
 
@@ -65,6 +68,11 @@ def unlikely(config: Config) -> Iterator[str]:
     yield from _light(config)
     yield from _apertures(config)
     yield from _differences(config)
+    if config.fidelity is not None and config.fidelity.memory < _LEAST_MEMORY:
+        yield (
+            f"fidelity.memory: {config.fidelity.memory} bytes is likely wrong: no image has room in them, and the "
+            "least is taken, which is slow; 1 GiB is 1073741824"
+        )
     if config.tolerance is not None and config.tolerance >= _TOLERANCE:
         yield (
             f"tolerance: {config.tolerance:g} is likely wrong: images of nothing meet it, for it is relative to the "

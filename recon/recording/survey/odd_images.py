@@ -1,4 +1,4 @@
-"""Images of a recording that can hardly be what was recorded: of one value, copies of one another, or clipped."""
+"""Images of a recording that can hardly be what was recorded: blank, copies of one another, or clipped."""
 
 import hashlib
 from collections import defaultdict
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool
+from scipy import ndimage
 
 from torchdic.files.format import Stack
 
@@ -13,17 +14,24 @@ from torchdic.files.format import Stack
 # parts of all pixels, and of those at the next value, a camera or a program has clipped what was brighter.
 _AT_TOP, _OF_NEXT = 0.01, 4
 
+# So many neighbours at the lowest value of an image are blank where the next value is higher by more than this part of
+# what the image's median is: dark light grades into it.
+_NEIGHBOURS, _GAP = 9, 0.1
+
 
 def odd_images(
     stack: Stack, counted: Bool[np.ndarray, "prism focus y x"] | None = None, prism: str = "prism"
 ) -> Iterator[str]:
-    """A line for what is likely wrong with whole images of a stack of counts, of which no two can be alike by chance.
+    """A line for what is likely wrong with images of a stack: of counts, no two can be alike by chance.
 
     counted: the pixels that count (True), None is all; an image without any is left aside. prism: what a setting is
-    called. Floats may be of a model without noise: of them nothing is said. Nor is it of a stack with a setting that is
-    of one value altogether, which is refused elsewhere.
+    called. Floats may be of a model without noise: of them only parts that are 0 are told. Nothing is said of a stack
+    with a setting that is of one value altogether, which is refused elsewhere.
     """
-    if stack.data.dtype.kind not in "iu" or any(images.min() == images.max() for images in stack.data):
+    if any(images.min() == images.max() for images in stack.data):
+        return
+    yield from _blank(stack.data, counted, prism)
+    if not stack.is_integer:
         return
     alike: dict[bytes, list[str]] = defaultdict(list)
     for place in np.ndindex(*stack.data.shape[:2]):
@@ -44,6 +52,33 @@ def odd_images(
             "taken twice in place of another"
         )
     yield from _clipped(stack.data if counted is None else stack.data[counted], stack.saturation)
+
+
+def _blank(data: np.ndarray, counted: Bool[np.ndarray, "prism focus y x"] | None, prism: str) -> Iterator[str]:
+    """A line for parts in which nothing is recorded: a program has shifted images, or a part of a file is missing."""
+    found = []
+    for place in np.ndindex(*data.shape[:2]):
+        image = data[place]
+        known = np.ones(image.shape, bool) if counted is None else counted[place]
+        if not known.any():
+            continue
+        low, middle = (float(of(image[known])) for of in (np.min, np.median))
+        at, above = known & (image == low), image[known & (image > low)]
+        if low != 0 and data.dtype.kind == "f":
+            continue
+        if middle > low and at.sum() >= _NEIGHBOURS and float(above.min()) - low > _GAP * (middle - low):
+            labels, _ = ndimage.label(at, np.ones((3, 3)))
+            size = int(np.bincount(labels[at]).max())
+            if size >= _NEIGHBOURS:
+                found.append((f"{prism} {place[0] + 1}, plane {place[1] + 1}", size, low, float(above.min())))
+    if found:
+        name, size, low, following = found[0]
+        more = f", and {len(found) - 1} further images have such parts" if len(found) > 1 else ""
+        yield (
+            f"{name}: {size} neighbouring pixels are {low:g}, and none is between that and {following:g}{more}: "
+            "nothing is recorded there, as where a program has shifted images or a part of a file is missing; leave "
+            "these pixels out (data.mask)"
+        )
 
 
 def _clipped(data: np.ndarray, saturation: float | None) -> Iterator[str]:

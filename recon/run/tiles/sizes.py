@@ -114,7 +114,8 @@ def _with_room(
     """
     setup, free = problem.setup, free_bytes(problem.misfit.data.device)
     assert free is not None  # else there was no lack of it
-    budget = budget or int(SHARE * free)
+    if budget is None or budget > free:  # so much can't be had
+        budget = int(SHARE * free)
     images = min(_memory(problem), budget // 2)
     problem = _with_memory(problem, images)
     fidelity, columns = problem.fidelity.coarse, math.prod(setup.volume.grid.shape[1:])

@@ -46,13 +46,14 @@ def _read_series(path: Path, number: int | None = None) -> Stack:
     axes = [axis if isinstance(axis, Mapping) else {"name": axis} for axis in named]
     letters = "".join(_letter(axis) for axis in axes)
     sizes = _sizes(axes, [image, finest], path)
-    data = np.ascontiguousarray(arrange(np.asarray(stored[...]), letters, path))
+    data = arrange(np.asarray(stored[...]), letters, path)
+    data = np.ascontiguousarray(data, dtype=data.dtype.newbyteorder("="))
     y, x, z = (sizes.get(axis) for axis in "YXZ")
     names = tuple(str(channel.get("label", "")) for channel in said.get("omero", {}).get("channels", ()))
     return Stack(
         data,
         pixel_size=None if y is None or x is None else (y, x),
-        focus_step=z if data.shape[1] > 1 else None,
+        focus_step=z,
         names=names if len(names) == len(data) and all(names) else (),
         source=str(path),
     )
