@@ -51,6 +51,16 @@ def test_the_trial_is_an_image_with_its_gradient(monkeypatch):
     assert forecast.whole(5) == pytest.approx(2.0 * forecast.cost(5) / (WITH_GRADIENT * image))
 
 
+@pytest.mark.parametrize(("first", "later", "counted"), [(0.4, 0.1, 0.1), (2.0, 0.3, 0.3), (40.0, 0.0, 40.0)])
+def test_a_first_image_in_which_memory_is_measured_is_not_counted(monkeypatch, first, later, counted):
+    """Of one that takes long it is a small part, and another one would take long, too."""
+    seconds = iter([first])
+    monkeypatch.setattr(forecast_room, "timed", lambda _run, repeats, _: [next(seconds, later) for _ in range(repeats)])
+    slow = Forecast(problem(steps=6)).whole()
+    seconds = iter([counted] * 9)
+    assert slow == pytest.approx(Forecast(problem(steps=6)).whole())
+
+
 @pytest.mark.parametrize(("seconds", "words"), [(0.2, "1 s"), (99.4, "99 s"), (150, "2 min"), (7200, "2.0 h")])
 def test_a_time_in_words(seconds, words):
     assert spoken(seconds) == words

@@ -61,7 +61,7 @@ def test_one_of_several_stacks_is_read_with_its_sizes_and_its_microscope(tmp_pat
 @pytest.mark.parametrize("kind", PACKAGES)
 def test_several_stacks_are_refused_with_what_takes_one(tmp_path, kind):
     path = of_maker(tmp_path, kind, counts())
-    with pytest.raises(StackError, match=r"series = 0 … 1 in \[data\] takes one of"):
+    with pytest.raises(StackError, match=r"series = 0 … 1 in \[data\], or --series of torchdic new, takes one"):
         read_stack(path)
     with pytest.raises(StackError, match="series 2 must be from 0 to 1: the file holds 2"):
         read_stack(path, 2)

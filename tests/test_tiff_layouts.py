@@ -115,7 +115,7 @@ def positions(path):
 def test_one_of_several_stacks_is_read_where_it_is_named_and_offered_where_not(tmp_path, write):
     path = tmp_path / "stacks.tif"
     write(path)
-    assert "series = 0 … 2 in [data] takes one" in the_error(path)
+    assert "series = 0 … 2 in [data], or --series of torchdic new, takes one" in the_error(path)
     for number, stack in enumerate(STACKS):
         assert np.array_equal(read_stack(path, number).data, stack)
     assert "series 3 must be from 0 to 2" in the_error(path, 3)

@@ -28,8 +28,10 @@ WITH_GRADIENT, MODEL, HESSIAN, RENEWED, MISSED = 2.75, 100.0, 4.0, 1 / 3, 0.7
 LAST = 3
 # Newton's steps end by themselves, as a rule after about so many.
 USUAL_STEPS = 17
-# A trial that takes fewer seconds is made TRIALS times: the first images of a process take longer.
-SHORT, TRIALS = 0.5, 3
+# The first images of a process take longer, and the first of a scene that fills its budget of memory by a second or
+# two, in which what it holds is measured. A trial of at most SHORT seconds is made TRIALS times more, one of at most
+# LONG once.
+SHORT, TRIALS, LONG = 0.5, 3, 15.0
 
 
 class Forecast:
@@ -119,7 +121,9 @@ def _trial(problem: Problem, fidelity: Fidelity) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the descent's own images will warn
         (first,) = timed(image_with_gradient, 1, device)
-        return first if first > SHORT else min(timed(image_with_gradient, TRIALS, device))
+        if first > LONG:
+            return first
+        return min(timed(image_with_gradient, TRIALS if first <= SHORT else 1, device))
 
 
 def _scene(problem: Problem) -> tuple[Volume, Microscope, Acquisition]:

@@ -81,6 +81,11 @@ class Format:
     folder: bool = False
 
 
+def offer_of_series(number: int) -> str:
+    """How one of several series is chosen, for messages."""
+    return f"series = 0 … {number - 1} in [data], or --series of torchdic new, takes one"
+
+
 def shape_text(shape: Sequence[int]) -> str:
     """A shape as messages show it: 2 × 5 × 64 × 64."""
     return " × ".join(str(n) for n in shape)

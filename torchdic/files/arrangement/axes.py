@@ -8,7 +8,7 @@ from jaxtyping import Shaped
 
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.arrangement.grey import coloured
-from torchdic.files.format import shape_text
+from torchdic.files.format import offer_of_series, shape_text
 
 # tifffile's letters: Q and I are axes without a name; P, R and M are places of the stage, or tiles
 _NAMELESS, _PLACES = "QI", "PRM"
@@ -77,7 +77,7 @@ def _places_of_axes(shape: tuple[int, ...], axes: str, path: Path) -> dict[str, 
     others = [axis for axis, n in zip(axes, shape, strict=True) if axis not in "CZYXSTQI" and n > 1]
     if others or len(nameless) > len(free):
         place = place_axis(shape, axes)
-        offer = "" if place is None else f"; series = 0 … {shape[place] - 1} in [data] takes one of its {shape[place]}"
+        offer = "" if place is None else f"; {offer_of_series(shape[place])}"
         raise StackError(
             f"{path}: has more dimensions ({axes}: {shape_text(shape)}) than a stack's (prism, focus, y, x){offer}"
         )

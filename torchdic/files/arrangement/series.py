@@ -8,7 +8,7 @@ import tifffile
 from torchdic.errors import StackError
 from torchdic.files.arrangement.axes import place_axis
 from torchdic.files.arrangement.grey import check_grey
-from torchdic.files.format import shape_text
+from torchdic.files.format import offer_of_series, shape_text
 
 Page = tifffile.TiffPage | tifffile.TiffFrame
 
@@ -32,7 +32,7 @@ def chosen_series(
         if len(series) > 1:
             if all(s.keyframe.samplesperpixel > 1 for s in series):
                 check_grey(series[0].keyframe, path)
-            raise StackError(f"{path}: {_described(series)}; a stack is one series: {_offer(len(series))}")
+            raise StackError(f"{path}: {_described(series)}; a stack is one series: {offer_of_series(len(series))}")
         return series[0], None
     place = place_axis(tuple(series[0].get_shape(squeeze=False)), series[0].get_axes(squeeze=False))
     places = series[0].get_shape(squeeze=False)[place] if len(series) == 1 and place is not None else 0
@@ -67,7 +67,3 @@ def _described(series: list[tifffile.TiffPageSeries]) -> str:
     distinct = list(dict.fromkeys(shapes))
     shown = ", ".join(distinct[:6]) + (", …" if len(distinct) > 6 else "")
     return f"holds {len(series)} unequal images ({shown})"
-
-
-def _offer(count: int) -> str:
-    return f"series = 0 … {count - 1} in [data] takes one"

@@ -7,6 +7,7 @@ from types import ModuleType
 from typing import TypeVar
 
 from torchdic.errors import StackError
+from torchdic.files.format import offer_of_series
 
 T = TypeVar("T")
 
@@ -19,7 +20,8 @@ def package(name: str, path: Path, extra: str = "bio") -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        kind, distribution = path.suffix.lower()[1:].upper(), name.partition(".")[0]
+        kind = "OME-Zarr" if extra == "zarr" else path.suffix[1:].upper()
+        distribution = name.partition(".")[0]
         raise StackError(
             f"{path}: {kind} files are read by the package {distribution}, which is missing: "
             f"pip install 'torchdic[{extra}]', or save the stack as OME-TIFF"
@@ -34,8 +36,7 @@ def chosen(held: Sequence[T], number: int | None, path: Path, kind: str) -> T:
     """
     last = len(held) - 1
     if number is None and last > 0:
-        offer = f"series = 0 … {last} in [data] takes one of them"
-        raise StackError(f"{path}: holds {len(held)} {kind}; a stack is one: {offer}")
+        raise StackError(f"{path}: holds {len(held)} {kind}; a stack is one: {offer_of_series(len(held))}")
     if not 0 <= (number or 0) <= last:
         raise StackError(f"{path}: series {number} must be from 0 to {last}: the file holds {len(held)}")
     return held[number or 0]
