@@ -186,6 +186,18 @@ def test_a_shear_that_is_given_reversed_is_warned_of(tmp_path, recording, capsys
     assert math.degrees(math.atan2(float(prism.shear[0]), float(prism.shear[1]))) == pytest.approx(220 - 360)
 
 
+@pytest.mark.parametrize("files", [1, 2])
+def test_pixels_that_are_no_squares_stay_so(tmp_path, recording, files, capsys):
+    names = [tmp_path / f"setting{number}.ome.tif" for number in range(files)]
+    for name, data in zip(names, np.split(recording.data, files), strict=True):
+        write_stack(name, data, (0.2, 0.15), 0.4)
+    assert new(*names, "--out", tmp_path / "run.toml") == 0
+    assert "0.2 × 0.15 µm (y × x)" in capsys.readouterr().out
+    config = load(tmp_path / "run.toml")
+    assert config.data is not None
+    assert config.volume.spacing[1:] == read_stack(config.data.files[0]).pixel_size == (0.2, 0.15)
+
+
 def test_init_is_an_alias(tmp_path, recording):
     stack = written(recording, tmp_path)
     assert main(["init", str(stack), "--out", str(tmp_path / "run.toml")]) == 0

@@ -112,12 +112,12 @@ def look(gathered: Gathered, given: Given) -> tuple[Survey, Settled]:
 
 def _join(gathered: Gathered, settled: Settled, path: Path) -> None:
     """Write the planes of several files as one stack beside the configuration."""
-    stack, pixel = gathered.stack, settled.pixel_size.value
+    stack, pixel = gathered.stack, (settled.pixel_height, settled.pixel_size.value)
     known = settled.step.origin != "assumed" and stack.data.shape[1] > 1
     write_stack(
         path,
         stack.data,
-        None if settled.pixel_size.origin == "assumed" else (pixel, pixel),
+        None if settled.pixel_size.origin == "assumed" else pixel,
         settled.step.value if known else None,
         bits=stack.bits,
         names=stack.names,

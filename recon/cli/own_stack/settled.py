@@ -23,6 +23,7 @@ _THICKEST = 1.0
 class Settled:
     """All values of a configuration, each with its origin.
 
+    pixel_size: along x. pixel_height: along y, in µm; as along x unless the file says otherwise.
     prisms: (length, angle in degrees, bias in degrees) of each setting. slices: of the volume, (number, spacing in µm).
     remarks: on the prisms, a line each, where what was given isn't what the images show.
     first: depth of the first plane in µm. offset: counts in the dark; None where the images are no counts.
@@ -30,6 +31,7 @@ class Settled:
     """
 
     pixel_size: Sourced
+    pixel_height: float
     step: Sourced
     wavelength: Sourced
     na: Sourced
@@ -41,6 +43,11 @@ class Settled:
     first: float
     offset: Sourced | None
     lower: bool
+
+    @property
+    def square(self) -> bool:
+        """Whether a pixel is as high as it is wide, but for rounding."""
+        return math.isclose(self.pixel_height, self.pixel_size.value, rel_tol=1e-3)
 
     @property
     def assumed(self) -> list[str]:
@@ -80,6 +87,7 @@ def settle(gathered: Gathered, found: Survey, given: Mapping[str, Any]) -> Settl
     prisms, remarks = settle_prisms(found, given, round(wavelength.value / (2 * reach), 2))
     return Settled(
         pixel_size=pixel,
+        pixel_height=stack.pixel_size[0] if pixel.origin == "file" and stack.pixel_size else pixel.value,
         step=step,
         wavelength=wavelength,
         na=na,

@@ -55,7 +55,8 @@ def _said(gathered: Gathered, settled: Settled) -> Iterator[Row]:
     def row(what: str, value: Sourced, unit: str = "") -> Row:
         return what, f"{value.value:g}{unit}", value.origin
 
-    yield row("pixel", settled.pixel_size, " µm")
+    height = "" if settled.square else f"{settled.pixel_height:g} × "
+    yield "pixel", f"{height}{settled.pixel_size.value:g} µm{' (y × x)' if height else ''}", settled.pixel_size.origin
     if gathered.stack.data.shape[1] > 1:
         yield row("focus step", settled.step, " µm")
     yield row("wavelength", settled.wavelength, " µm")

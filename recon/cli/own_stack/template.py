@@ -85,7 +85,7 @@ def _microscope(settled: Settled) -> list[Line]:
 
 def _volume(gathered: Gathered, settled: Settled) -> list[Line]:
     _, planes, height, width = gathered.stack.data.shape
-    number, thickness = settled.slices
+    (number, thickness), pixel = settled.slices, settled.pixel_size
     why = "one plane shows no depth" if planes == 1 else "they fill the focus range and go on beyond it"
     if planes > 1 and thickness == settled.step.value:
         size = "the focus step"
@@ -94,7 +94,7 @@ def _volume(gathered: Gathered, settled: Settled) -> list[Line]:
     return [
         _line("background", settled.background),
         Line("shape", [number, height, width], f"slices: {why}; (y, x): the file's pixels"),
-        _line("pixel_size", settled.pixel_size),
+        Line("pixel_size", pixel.value if settled.square else [settled.pixel_height, pixel.value], pixel.comment),
         Line("slice_thickness", thickness, f"chosen: {size}"),
     ]
 
