@@ -104,4 +104,5 @@ def test_a_spot_is_as_sharp_as_the_objective_permits():
     parts = ((2 * bessel / v) ** 2).reshape(3, 200, 3, 200).sum((1, 3))
     assert sharpest(MICROSCOPE, (0.1, 0.2), 1.36) == pytest.approx(2 * parts[1, 1] / parts[1, 2], rel=1e-3)
     assert sharpest(MICROSCOPE, (0.01, 0.01), 1.36) == 4.0
+    assert sharpest(MICROSCOPE, (150.0, 150.0), 1.36) == 20.0  # nm that were taken for µm; no integral warns
     assert sharpest(MICROSCOPE, (2.0, 2.0), 1.36) == sharpest(Microscope(0.546), (0.2, 0.2), 1.36) == 20.0

@@ -28,6 +28,9 @@ _THIRD = 3
 # greatest ratio of both: of pixels that are finer than the light, and of those so coarse that a spot lights one alone.
 _FURTHER, _LEAST, _MOST = 2.0, 4.0, 20.0
 
+# A pixel of more λ/NA holds the whole spot: of 1 λ/NA already the ratio is the greatest.
+_WIDE = 4.0
+
 # Rounds in which the pixels found are taken out and others are looked for beside them.
 _ROUNDS = 3
 
@@ -45,6 +48,8 @@ def sharpest(microscope: Microscope, pixel_size: tuple[float, float], background
         return _MOST
     width = max(pixel_size)
     scale = 2 * math.pi * microscope.objective.reach(background) / microscope.wavelength
+    if scale * width > 2 * math.pi * _WIDE:
+        return _MOST
 
     def light(centre: float) -> float:
         def airy(x: float, y: float) -> float:
