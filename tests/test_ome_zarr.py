@@ -11,6 +11,8 @@ import torch
 
 from recon.cli import main
 from recon.config import load
+from recon.config.schema import ConfigError
+from recon.run.folder.prepared import check_folder
 from torchdic import Grid
 from torchdic.errors import StackError, StackWarning
 from torchdic.files.gathered import gather
@@ -95,6 +97,18 @@ def test_what_is_written_is_what_the_specification_asks_for(tmp_path, suffix, ve
     found = models.Image.from_zarr(zarr.open_group(str(tmp_path / f"stack{suffix}"), mode="r")).attributes
     said = found if version == "v04" else found.ome
     assert [axis.unit for axis in said.multiscales[0].axes] == [None] * 4
+
+
+@SUFFIXES
+def test_an_array_within_one_is_refused_and_so_are_results_in_it(tmp_path, suffix):
+    path = tmp_path / f"stack{suffix}"
+    write_stack(path, counts(1, 3, 5, 7))
+    with pytest.raises(StackError, match="0: is an array alone; name the OME-Zarr that holds it"):
+        read_stack(path / "0")
+    for out in (path, path / "results"):
+        with pytest.raises(ConfigError, match=rf"can't be written to: .*stack{suffix} is an OME-Zarr"):
+            check_folder(out)
+    check_folder(tmp_path / "results")
 
 
 def test_numbers_of_another_byte_order_are_the_machines_own(tmp_path):

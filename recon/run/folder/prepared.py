@@ -7,11 +7,12 @@ from pathlib import Path
 from recon.config.schema import ConfigError
 from recon.run.checkpoint import UnsavedWarning
 from recon.run.folder.lock import held_folder, hold, is_lost
+from torchdic.files.extras.ome_zarr import is_zarr
 from torchdic.files.whole import written_whole
 
 
 def check_folder(out: Path) -> None:
-    """Raise ConfigError where `out` can't become a folder to write to, as where it is a file. Nothing is touched."""
+    """Raise ConfigError where `out` can't become a folder to write to, as where it is a file or an image. Nothing is touched."""
     there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
     if not os.path.exists(there):
         raise ConfigError(f"{out}: can't be written to: {there} is a link to {os.readlink(there)}, which isn't there")
@@ -19,6 +20,9 @@ def check_folder(out: Path) -> None:
         raise ConfigError(f"{out}: can't be written to: {there} is a file, not a folder")
     if not os.access(there, os.W_OK | os.X_OK):
         raise ConfigError(f"{out}: can't be written to: no permission to write in {there}")
+    image = next((folder for folder in (there, *there.absolute().parents) if is_zarr(folder)), None)
+    if image is not None:
+        raise ConfigError(f"{out}: can't be written to: {image} is an OME-Zarr, which holds images alone")
 
 
 def prepare_folder(out: Path) -> None:

@@ -19,8 +19,8 @@ from torchdic.files.format import Format, Stack
 
 Version = Literal["0.4", "0.5"]
 
-# Files of which a Zarr group has one.
-_MARKS = ("zarr.json", ".zgroup", ".zattrs")
+# Files of which what Zarr has written has one.
+_MARKS = ("zarr.json", ".zgroup", ".zattrs", ".zarray")
 
 # The axes of images before version 0.3, which don't name them.
 _USUAL = "TCZYX"
@@ -64,7 +64,9 @@ def _image(path: Path, number: int | None) -> Any:
     zarr = package("zarr", path, "zarr")
     if not is_zarr(path):
         raise StackError(f"{path}: holds nothing of Zarr's: none of {', '.join(_MARKS)}")
-    group = zarr.open_group(str(path), mode="r")
+    group = zarr.open(str(path), mode="r")
+    if isinstance(group, zarr.Array):
+        raise StackError(f"{path}: is an array alone; name the OME-Zarr that holds it, whose attributes say its axes")
     said = _said(group)
     if "multiscales" in said:
         images = [group]
