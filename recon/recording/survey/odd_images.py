@@ -3,6 +3,7 @@
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -67,8 +68,8 @@ def _blank(data: np.ndarray, counted: Bool[np.ndarray, "prism focus y x"] | None
         if low != 0 and data.dtype.kind == "f":
             continue
         if middle > low and at.sum() >= _NEIGHBOURS and float(above.min()) - low > _GAP * (middle - low):
-            labels, _ = ndimage.label(at, np.ones((3, 3)))
-            size = int(np.bincount(labels[at]).max())
+            parts: Any = ndimage.label(at, np.ones((3, 3)))
+            size = int(np.bincount(parts[0][at]).max())
             if size >= _NEIGHBOURS:
                 found.append((f"{prism} {place[0] + 1}, plane {place[1] + 1}", size, low, float(above.min())))
     if found:

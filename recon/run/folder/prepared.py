@@ -12,7 +12,7 @@ from torchdic.files.whole import written_whole
 
 
 def check_folder(out: Path) -> None:
-    """Raise ConfigError where `out` can't become a folder to write to, as where it is a file or an image. Nothing is touched."""
+    """Raise ConfigError where `out` can't become a folder of results, as where it is a file. Nothing is touched."""
     there = next(folder for folder in (out, *out.absolute().parents) if os.path.lexists(folder))
     if not os.path.exists(there):
         raise ConfigError(f"{out}: can't be written to: {there} is a link to {os.readlink(there)}, which isn't there")
