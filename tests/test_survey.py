@@ -256,13 +256,15 @@ def test_parts_in_which_nothing_is_recorded_are_named(dtype):
 
 
 def test_dark_pixels_are_not_taken_for_parts_without_a_record():
-    """Few dead ones; light that is dark here and there; a dark edge of a model without noise."""
+    """Few dead ones; light that is dark here and there; few levels of grey; a dark edge of a model without noise."""
     data = counts()
     data[..., ::8, ::8] = 0
     dim = np.random.default_rng(4).poisson(np.linspace(0, 8, 24) ** 2 * np.ones((2, 4, 24, 1))).astype(np.uint16)
     model = np.full((1, 2, 24, 24), 0.5, np.float32)
     model[..., :4], model[..., 20:] = 0.1, 0.9
-    for images in (data, dim, model):
+    few = (counts() // 60 - 7).astype(np.uint8) * 16
+    few[..., :4, :4] = few.min()
+    for images in (data, dim, few, model):
         assert list(odd_images(Stack(images, source="a.tif"))) == []
 
 

@@ -16,8 +16,8 @@ from torchdic.files.format import Stack
 _AT_TOP, _OF_NEXT = 0.01, 4
 
 # So many neighbours at the lowest value of an image are blank where the next value is higher by more than this part of
-# what the image's median is: dark light grades into it.
-_NEIGHBOURS, _GAP = 9, 0.1
+# what the median is, and by more than so many times what the next ones are apart: dark light grades into it.
+_NEIGHBOURS, _GAP, _APART = 9, 0.1, 4.0
 
 
 def odd_images(
@@ -64,14 +64,17 @@ def _blank(data: np.ndarray, counted: Bool[np.ndarray, "prism focus y x"] | None
         if not known.any():
             continue
         low, middle = (float(of(image[known])) for of in (np.min, np.median))
-        at, above = known & (image == low), image[known & (image > low)]
-        if low != 0 and data.dtype.kind == "f":
+        at = known & (image == low)
+        if middle == low or at.sum() < _NEIGHBOURS or (low != 0 and data.dtype.kind == "f"):
             continue
-        if middle > low and at.sum() >= _NEIGHBOURS and float(above.min()) - low > _GAP * (middle - low):
-            parts: Any = ndimage.label(at, np.ones((3, 3)))
-            size = int(np.bincount(parts[0][at]).max())
-            if size >= _NEIGHBOURS:
-                found.append((f"{prism} {place[0] + 1}, plane {place[1] + 1}", size, low, float(above.min())))
+        above = image[known & (image > low)]
+        if (gap := float(above.min()) - low) <= _GAP * (middle - low):
+            continue
+        steps = np.diff(np.unique(above)[:5].astype(float))
+        parts: Any = ndimage.label(at, np.ones((3, 3)))
+        size = int(np.bincount(parts[0][at]).max())
+        if size >= _NEIGHBOURS and len(steps) and gap > _APART * float(np.median(steps)):
+            found.append((f"{prism} {place[0] + 1}, plane {place[1] + 1}", size, low, low + gap))
     if found:
         name, size, low, following = found[0]
         more = f", and {len(found) - 1} further images have such parts" if len(found) > 1 else ""
