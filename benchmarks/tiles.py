@@ -1,12 +1,12 @@
 """A field fitted in tiles beside the same field fitted whole: how far apart they are, at the seams too, and the cost.
 
-    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...]
+    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...] [--pixels 288]
 
 Images come from a finer model than the fits', with noise (`scenes.py`). Each field has specimens on its seams. "apart"
 is the distance of the two volumes over the whole fit's length, "at seams" the same of the voxels in which two tiles are
 blended; "error" is that of each from the truth. "jump" is the mean |step| of Δn from one voxel to the next across the
-seams' middles over the same of the whole fit. Seconds are of the processor, and memory is what a descent is foreseen to
-hold.
+seams' middles over the same of the whole fit. "weight" is that of the tiles' priors over that of the whole fit's.
+Seconds are of the processor, and memory is what a descent is foreseen to hold.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import time
 import warnings
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -23,7 +24,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 import scenes
-from data_synthetic import Bead, CellPhantom, Ellipsoid
+from data_synthetic import Bead, CellPhantom, Ellipsoid, Specimen
 from recon.descend import Problem, Recipe, minimise
 from recon.fit.bounds import Bounds
 from recon.fit.setup import Setup, empty_medium
@@ -37,69 +38,77 @@ from recon.run.tiles.sizes import OVERLAP
 from recon.tiling.blending import blended_volume
 from recon.tiling.layout import Layout
 from recon.tiling.part import SharedByTiles, problem_of_tile, strongest_first
-from specimens import GradedEllipsoid, Together
+from specimens import GradedEllipsoid, Together, moved
 from torchdic import Grid
 
-FIELD = Grid((12, 144, 144), (0.4, 0.17, 0.17))
+VOXEL = (0.4, 0.17, 0.17)
+SLICES = 12
 FOCUS = tuple(0.6 * (i - 3.5) for i in range(8))
-SIDE = 92
+
+# Pixels of the tiles' overlap, and µm from the field's border within which no specimen has its centre.
+SHARED, BORDER = 40, 2.5
 
 
-def beads() -> Together:
-    """Beads of several sizes and contrasts, two of them on the seams."""
-    generator = torch.Generator().manual_seed(8)
-    places = [
-        (-8.5, -8.7),
-        (-9.0, 0.2),
-        (-8.3, 8.6),
-        (0.1, -8.4),
-        (0.3, 0.4),
-        (-0.6, 8.9),
-        (8.7, -8.5),
-        (8.9, 0.7),
-        (8.2, 9.0),
-    ]
-    found = []
-    for y, x in places:
-        z, radius, contrast = torch.rand(3, generator=generator).tolist()
-        found.append(Bead(0.8 + 0.6 * radius, 0.008 + 0.014 * contrast, 1.36, (1.6 * z - 0.8, y, x)))
-    return Together(tuple(found))
+def field_of(pixels: int) -> Grid:
+    """The field of so many pixels along a side."""
+    return Grid((SLICES, pixels, pixels), VOXEL)
 
 
-def graded() -> Together:
+def within(field: Grid, placed: list[tuple[Specimen, tuple[float, float]]]) -> Together:
+    """Those specimens, given with their places (y, x), that lie within a field."""
+    far = field.extent[1] / 2 - BORDER
+    return Together(tuple(specimen for specimen, (y, x) in placed if max(abs(y), abs(x)) < far))
+
+
+def beads(field: Grid) -> Together:
+    """Beads of several sizes and contrasts, in rows of which the middle ones lie on the seams."""
+    generator, found = torch.Generator().manual_seed(8), []
+    for row, column in product(range(-2, 3), repeat=2):
+        z, y, x, radius, contrast = torch.rand(5, generator=generator).tolist()
+        place = (1.6 * z - 0.8, 9 * row + 1.8 * y - 0.9, 9 * column + 1.8 * x - 0.9)
+        found.append((Bead(0.8 + 0.6 * radius, 0.008 + 0.014 * contrast, 1.36, place), place[1:]))
+    return within(field, found)
+
+
+def lumps(field: Grid) -> Together:
     """Smooth lumps above and below the medium's index, whose sign nobody knows."""
-    shapes = [
-        ((-5.5, -5.0), 0.012),
-        ((0.3, -4.0), -0.009),
-        ((-4.0, 4.5), -0.012),
-        ((4.5, 4.6), 0.010),
-        ((5.5, -3.5), 0.008),
-    ]
-    return Together(
-        tuple(
-            GradedEllipsoid(Ellipsoid((1.4, 2.0, 2.4), (0.2 * i - 0.4, y, x)), contrast, 1.36)
-            for i, ((y, x), contrast) in enumerate(shapes)
-        )
-    )
+    generator, found = torch.Generator().manual_seed(5), []
+    for row, column in product(range(4), range(5)):
+        z, y, x, a, b, c, contrast, sign = torch.rand(8, generator=generator).tolist()
+        place = (1.2 * z - 0.6, 10 * row - 17 + 4 * y, 9.5 * column - 21 + 4 * x)
+        shape = Ellipsoid((1.0 + 0.6 * a, 1.6 + 1.2 * b, 1.6 + 1.2 * c), place)
+        contrast = (0.006 + 0.007 * contrast) * (1 if sign < 0.5 else -1)
+        found.append((GradedEllipsoid(shape, contrast, 1.36), place[1:]))
+    return within(field, found)
 
 
-def setups() -> dict[str, scenes.Setup]:
+def cells(field: Grid) -> Together:
+    """A cell where four tiles meet, one on the seam of two, and others in each tile."""
+    places = [(0.0, 0.0), (-11.0, 1.0), (-12.0, -13.0), (10.0, -9.5), (9.0, 12.0), (-10.0, 14.0)]
+    return within(field, [(moved(CellPhantom(), (0.0, *place)), place) for place in places])
+
+
+def setups(field: Grid) -> dict[str, scenes.Setup]:
     """The scenes by name."""
     acquisition = scenes.acquisition(scenes.SHEARS, (math.pi / 2,), FOCUS)
-    usual = scenes.Setup("tiles", beads(), FIELD, acquisition=acquisition, photons=20000.0)
+    usual = scenes.Setup("tiles", beads(field), field, acquisition=acquisition, photons=20000.0)
     return {
         "beads": usual,
         "dim beads": replace(usual, photons=4000.0, seed=1),
-        "cell": replace(usual, specimen=CellPhantom(), seed=2),
-        "lumps of any sign": replace(usual, specimen=graded(), bounds=(None, None), seed=3),
+        "cells": replace(usual, specimen=cells(field), seed=2),
+        "lumps of any sign": replace(usual, specimen=lumps(field), bounds=(None, None), seed=3),
     }
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A volume (z, y, x), the processor's seconds, and the bytes that its descent is foreseen to hold."""
+    """A volume (z, y, x), the weight of its priors, seconds, and the bytes that its descent is foreseen to hold.
+
+    weight: per pixel, over the same scale of the misfit in the whole field and in its tiles. seconds: the processor's.
+    """
 
     delta: Float[Tensor, "z y x"]
+    weight: float
     seconds: float
     bytes: int
 
@@ -111,23 +120,29 @@ def solved(problem: Problem) -> tuple[Step, float]:
     return last, time.process_time() - began
 
 
+def weight_of(problem: Problem, last: Step) -> float:
+    """The weight of a fit's priors per pixel, with its misfit in the unit of the images."""
+    return last.weights[-1]["tv"] * float(problem.misfit.variance.mean()) / problem.setup.dilution
+
+
 def fitted_whole(problem: Problem) -> Fit:
     """The field in one fit."""
     last, seconds = solved(problem)
-    return Fit(last.delta, seconds, bytes_held(problem, GaussianMisfit))
+    return Fit(last.delta, weight_of(problem, last), seconds, bytes_held(problem, GaussianMisfit))
 
 
 def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...]) -> Fit:
     """The field in tiles."""
-    shared, found, total, largest = None, [], 0.0, 0
+    shared, found, total, weight, largest = None, [], 0.0, 0.0, 0
     for tile in strongest_first(layout, problem.misfit):
         part = problem_of_tile(problem, layout, tile, noise, shared)
         last, seconds = solved(part)
         if shared is None:
-            shared, largest = SharedByTiles.by(part, last), bytes_held(part, GaussianMisfit)
+            shared = SharedByTiles.by(part, last)
+            weight, largest = weight_of(part, last), bytes_held(part, GaussianMisfit)
         found.append((tile, last.delta))
         total += seconds
-    return Fit(blended_volume(layout, FIELD.shape[0], found), total, largest)
+    return Fit(blended_volume(layout, SLICES, found), weight, total, largest)
 
 
 def seams(layout: Layout) -> Bool[Tensor, "y x"]:
@@ -148,7 +163,7 @@ def jump(delta: Float[Tensor, "z y x"], layout: Layout) -> float:
 
 def draw(name: str, whole: Fit, tiles: Fit, layout: Layout, path: Path) -> None:
     """A section through both volumes and ten times their difference, with the seams' middles."""
-    middle = FIELD.shape[0] // 2
+    middle = SLICES // 2
     most = float(whole.delta[middle].abs().max())
     pictures = {"whole": whole.delta, "in tiles": tiles.delta, "10 × difference": 10 * (tiles.delta - whole.delta)}
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained")
@@ -164,38 +179,48 @@ def draw(name: str, whole: Fit, tiles: Fit, layout: Layout, path: Path) -> None:
     plt.close(figure)
 
 
+def row(name: str, scene: scenes.Scene, layout: Layout, out: Path) -> str:
+    """Fit a scene both ways, draw it, and return its row."""
+    setup = Setup(empty_medium(scene.grid, scene.background, scene.data), scene.microscope, scene.acquisition)
+    recipe = Recipe(bounds=Bounds(*scene.bounds))
+    problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, GaussianMisfit, scene.noise)
+    whole, tiles = fitted_whole(problem), fitted_in_tiles(problem, layout, scene.noise)
+    draw(name, whole, tiles, layout, out / f"{name.replace(' ', '_')}.png")
+    at = seams(layout)
+    columns = [
+        f"{volume_error(tiles.delta, whole.delta):.3f}",
+        f"{volume_error(tiles.delta[:, at], whole.delta[:, at]):.3f}",
+        *(f"{volume_error(fit.delta, scene.truth):.3f}" for fit in (whole, tiles)),
+        f"{jump(tiles.delta, layout) / jump(whole.delta, layout):.2f}",
+        f"{tiles.weight / whole.weight:.2f}",
+        *(f"{fit.seconds:.0f}" for fit in (whole, tiles)),
+        *(f"{fit.bytes / 2**20:.0f}" for fit in (whole, tiles)),
+    ]
+    return f"| {name} | {' | '.join(columns)} |"
+
+
+HEAD = """
+| scene | apart | at seams | error whole | in tiles | jump | weight | seconds whole | in tiles | MiB whole | a tile |
+|---|---|---|---|---|---|---|---|---|---|---|"""
+
+
 def main() -> None:
     """Fit each scene both ways and print a row for it."""
+    names = list(setups(field_of(144)))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("tiles"))
-    parser.add_argument("--scenes", nargs="+", choices=list(setups()), default=list(setups()))
+    parser.add_argument("--scenes", nargs="+", choices=names, default=names)
+    parser.add_argument("--pixels", type=int, default=288, help="of the field along a side")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")
-    margin = margin_beyond(FIELD, scenes.MICROSCOPE, 1.36)
-    layout = Layout.of(FIELD, FIELD, SIDE, margin, OVERLAP * margin)
-    print(f"{len(layout)} tiles of {SIDE} voxels, margin {margin}, overlap {OVERLAP * margin} of {FIELD.shape}\n")
-    print(
-        "| scene | apart | at seams | error whole | in tiles | jump | seconds whole | in tiles | MiB whole | a tile |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    field = field_of(options.pixels)
+    margin, side = margin_beyond(field, scenes.MICROSCOPE, 1.36), (options.pixels + SHARED) // 2
+    layout = Layout.of(field, field, side, margin, OVERLAP * margin)
+    print(f"{len(layout)} tiles of {side} voxels, margin {margin}, overlap {SHARED} of {field.shape}\n{HEAD}")
     for name in options.scenes:
-        scene = setups()[name].scene(name, options.out / "cache")
-        setup = Setup(empty_medium(FIELD, scene.background, scene.data), scene.microscope, scene.acquisition)
-        recipe = Recipe(bounds=Bounds(*scene.bounds))
-        problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, GaussianMisfit, scene.noise)
-        whole, tiles = fitted_whole(problem), fitted_in_tiles(problem, layout, scene.noise)
-        at = seams(layout)
-        columns = [
-            f"{volume_error(tiles.delta, whole.delta):.3f}",
-            f"{volume_error(tiles.delta[:, at], whole.delta[:, at]):.3f}",
-            *(f"{volume_error(fit.delta, scene.truth):.3f}" for fit in (whole, tiles)),
-            f"{jump(tiles.delta, layout) / jump(whole.delta, layout):.2f}",
-            *(f"{fit.seconds:.0f}" for fit in (whole, tiles)),
-            *(f"{fit.bytes / 2**20:.0f}" for fit in (whole, tiles)),
-        ]
-        print(f"| {name} | {' | '.join(columns)} |", flush=True)
-        draw(name, whole, tiles, layout, options.out / f"{name.replace(' ', '_')}.png")
+        scene = setups(field)[name].scene(name, options.out / "cache")
+        print(row(name, scene, layout, options.out), flush=True)
 
 
 if __name__ == "__main__":

@@ -244,6 +244,40 @@ def test_other_tiles_hold_what_the_first_has_found(field):
     assert own.weight.noise_misfit == pytest.approx(NOISE**2 / float(own.misfit.variance.mean()), rel=0.05)
 
 
+def test_the_first_tiles_weight_goes_by_the_pixels_that_count_in_the_field(field):
+    """What the others show, as of a specimen beyond the margin, doesn't move it."""
+    whole, _ = field
+    layout = layout_of(FIELD, 40, 5, 10)
+    left, right = layout
+    rules = [problem_of_tile(whole, layout, tile, [NOISE] * 2).weight for tile in (left, right)]
+    # 16 pixels overlap; beyond the middle quarter of them one tile counts alone
+    assert [(rule.inside.rows, rule.inside.columns) for rule in rules] == [
+        (slice(0, 24), slice(0, 34)),
+        (slice(0, 24), slice(6, 40)),
+    ]
+    assert [rule.pixels for rule in rules] == [2 * 3 * 24 * 34] * 2
+    rule, misfit = rules[0], problem_of_tile(whole, layout, left, [NOISE] * 2).misfit
+    images = misfit.data + 0.01
+    disturbed = images.clone()
+    disturbed[..., 34:] += 1.0
+    value, others = (float(misfit(each)) for each in (images, disturbed))
+    assert others > 10 * value
+    assert rule.heeded(disturbed, others) == pytest.approx(rule.heeded(images, value))
+    assert rule.white(disturbed, misfit) == pytest.approx(rule.white(images, misfit))
+    assert rule.heeded(images, value) == pytest.approx(value, rel=1e-3)  # in the unit of the whole tile
+
+
+def test_where_a_prism_has_no_pixel_inside_a_tile_the_weight_goes_by_all(field):
+    whole, _ = field
+    layout = layout_of(FIELD, 40, 5, 10)
+    mask = torch.ones(2, 3, 24, 64, dtype=torch.bool)
+    mask[1, :, :, :34] = False
+    masked = replace(whole, misfit=GaussianMisfit(whole.misfit.data, None, mask))
+    left, right = layout
+    assert problem_of_tile(masked, layout, left, [NOISE] * 2).weight.inside is None
+    assert problem_of_tile(masked, layout, right, [NOISE] * 2).weight.inside is not None
+
+
 def test_given_weights_mean_in_a_tile_what_they_mean_in_the_whole(field):
     """Per voxel: the misfit's slope and the priors' keep their ratio, though the tile has a margin."""
     whole, truth = field

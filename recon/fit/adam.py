@@ -14,7 +14,7 @@ from recon.fit.step import Step, check_convergence
 from recon.fit.unknowns import IndexDifference, Unknowns
 from recon.prior.base import contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import BEGUN, WeightRecord, record, whiteness
+from recon.prior.weight import BEGUN, WeightRecord, record
 from torchdic.errors import UnstableError
 
 # Share of the steps before the priors know the specimen's contrast, and steps between two weights that follow the
@@ -115,6 +115,7 @@ def _followed(
     before = weights[-1]["misfit"]
     if math.isnan(before):
         before = math.inf if step < UNTIL_CONTRAST * problem.steps else None
-    white, width = whiteness(images, problem.misfit), EDGE * max(contrast(delta), 1e-9) / problem.setup.dilution
+    misfit, white = problem.weight.heeded(images, misfit), problem.weight.white(images, problem.misfit)
+    width = EDGE * max(contrast(delta), 1e-9) / problem.setup.dilution
     weight, reason = problem.weight.next(weights, misfit, before, white, width)
     return (*weights, record(step + 1, weight, reason, misfit, white))

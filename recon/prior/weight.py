@@ -59,6 +59,19 @@ USUAL, UNSURE, FAR = 1.0, 1.0, math.e
 WeightRecord = dict[str, Any]
 
 
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """The part of the images by which a weight goes. misfit: of that part. rows, columns: its pixels."""
+
+    misfit: Misfit
+    rows: slice
+    columns: slice
+
+    def of(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, "prism focus row column"]:
+        """The part of images."""
+        return images[..., self.rows, self.columns]
+
+
 @dataclass(frozen=True)
 class FollowsNoise:
     """The common weight of the priors as a descent goes on.
@@ -66,12 +79,24 @@ class FollowsNoise:
     noise_misfit: what noise alone leaves of the misfit, as it was measured in the images; None where it wasn't: then
     the residual alone tells it. pixels: of all images, that count. first: the weight at first; None is chosen by the
     specimen's contrast. held: whether the weight stays as it is, as where other images are fitted in the same way.
+    inside: the part of the images that misfit and pixels are of, where the others show what the volume can't explain;
+    None is all.
     """
 
     noise_misfit: float | None
     pixels: int
     first: float | None = None
     held: bool = False
+    inside: Inside | None = None
+
+    def heeded(self, images: Float[Tensor, "prism focus y x"], value: float) -> float:
+        """The misfit by which the weight goes. images: the model's. value: of the misfit of them all."""
+        return value if self.inside is None else float(self.inside.misfit(self.inside.of(images)))
+
+    def white(self, images: Float[Tensor, "prism focus y x"], misfit: Misfit) -> float:
+        """The whiteness of the residual by which the weight goes. images: the model's. misfit: of them all."""
+        part = self.inside
+        return whiteness(images, misfit) if part is None else whiteness(part.of(images), part.misfit)
 
     def aim(self, misfit: float, white: float, usual: float) -> float:
         """The misfit that is aimed at.

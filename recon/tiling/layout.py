@@ -106,6 +106,12 @@ class Axis:
         """How much each tile counts at each pixel, float64."""
         return self._weights(torch.arange(self.pixels, dtype=torch.float64))
 
+    def counting(self, tile: int) -> slice:
+        """The pixels of a tile, from its first, at which it counts at all. tile: its number along the axis."""
+        span = self.spans[tile].pixels
+        places = torch.nonzero(self.weights_of_pixels()[tile, span] > 0).flatten()
+        return slice(int(places[0]), int(places[-1]) + 1)
+
     def weights_of_voxels(self) -> Float[Tensor, "tile voxel"]:
         """How much each tile counts at each voxel of the field, float64; outer tiles count as far as its ends."""
         voxel = torch.arange(self.voxels, dtype=torch.float64)

@@ -20,7 +20,7 @@ from recon.fit.unknowns import IndexDifference, Unknown, with_support
 from recon.misfit.base import Misfit
 from recon.misfit.level import image_means
 from recon.prior.base import contrast
-from recon.prior.weight import FollowsNoise
+from recon.prior.weight import FollowsNoise, Inside
 from recon.tiling.layout import Layout, Span, Tile
 
 
@@ -73,7 +73,7 @@ def lacks(whole: Problem, layout: Layout, tile: Tile) -> str | None:
     """Why there is nothing to fit in a tile; None where there is. whole: without a margin."""
     mask, support = whole.misfit.mask, whole.support
     if mask is not None:
-        counts = mask[..., tile.rows.pixels, tile.columns.pixels].flatten(1).any(1).tolist()
+        counts = _counting(mask[..., tile.rows.pixels, tile.columns.pixels]).tolist()
         if not all(counts):
             return f"no pixel of prism {counts.index(False) + 1} counts" if any(counts) else "no pixel counts"
     if support is not None and not bool(_with_margin(support, tile, layout.margin).any()):
@@ -104,24 +104,43 @@ def problem_of_tile(
                 setup = unknown.put(shared.values[unknown.name].to(misfit.data.device), setup)
         unknowns = [unknown for unknown in unknowns if _is_of_tile(unknown)]
     tile_problem = replace(whole, setup=setup, misfit=misfit, unknowns=unknowns)
+    inside = _inside(misfit, layout, tile) if shared is None else None
     return replace(
-        tile_problem, weight=_weight(whole, tile_problem, noise, shared), contrast=shared and shared.contrast
+        tile_problem, weight=_weight(whole, tile_problem, inside, noise, shared), contrast=shared and shared.contrast
     )
 
 
-def _weight(whole: Problem, tile: Problem, noise: Sequence[float] | None, shared: SharedByTiles | None) -> FollowsNoise:
-    """The common factor of a tile's priors: found by the first tile, and held by the others.
+def _inside(misfit: Misfit, layout: Layout, tile: Tile) -> Inside | None:
+    """The pixels of a tile that count in the blended field; None where a prism has none there.
+
+    What lies beyond the margin shows in the others, too, and no volume of the tile explains it.
+    """
+    rows, columns = layout.along_y.counting(tile.place[0]), layout.along_x.counting(tile.place[1])
+    if misfit.mask is not None and not _counting(misfit.mask[..., rows, columns]).all():
+        return None
+    return Inside(misfit.part(rows, columns, misfit), rows, columns)
+
+
+def _weight(
+    whole: Problem, tile: Problem, inside: Inside | None, noise: Sequence[float] | None, shared: SharedByTiles | None
+) -> FollowsNoise:
+    """The common factor of a tile's priors: found by the first tile, from what is inside it, and held by the others.
 
     Where the weights are given, they are those of the whole field without a margin.
     """
-    misfit = tile.misfit
+    misfit = tile.misfit if inside is None else inside.misfit
     pixels = int(misfit.pixels.sum())
     if whole.weight is None:
         return FollowsNoise(None, pixels, tile.setup.dilution, held=True)
     known = misfit.of_noise(noise) if misfit.knows_all and noise is not None else None
     if shared is None:
-        return replace(whole.weight, noise_misfit=known, pixels=pixels)
+        return replace(whole.weight, noise_misfit=known, pixels=pixels, inside=inside)
     return FollowsNoise(known, pixels, shared.weight, held=True)
+
+
+def _counting(mask: Bool[Tensor, "prism focus y x"]) -> Bool[Tensor, " prism"]:
+    """Whether a pixel of each prism counts."""
+    return mask.flatten(1).any(1)
 
 
 def _is_of_tile(unknown: Unknown) -> bool:

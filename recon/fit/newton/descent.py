@@ -34,7 +34,7 @@ from recon.fit.unknowns import IndexDifference, with_values
 from recon.misfit.level import neighbours
 from recon.prior.base import Majorant, contrast, weighted
 from recon.prior.edges import EDGE
-from recon.prior.weight import BEGUN, record, whiteness
+from recon.prior.weight import BEGUN, record
 from torchdic import Fidelity
 from torchdic.errors import SidewaysError, TurnedRaysError, UnstableError
 from torchdic.scalar import number as number_of
@@ -205,7 +205,9 @@ class _Descent:
     def judged(self, formed: Formed) -> Judged:
         """The misfit and its gradient of a volume."""
         (gradient,) = torch.autograd.grad(formed.misfit, formed.delta)
-        return Judged(formed.value, gradient, formed.recorded.detach())
+        recorded, rule = formed.recorded.detach(), self.problem.weight
+        heeded = formed.value if rule is None else rule.heeded(recorded, formed.value)
+        return Judged(formed.value, heeded, gradient, recorded)
 
     def corrected(self, place: Place, formed: Formed, exact: Fidelity) -> Correction:
         """The correction of a place's images to those of the careful fidelity."""
@@ -373,12 +375,12 @@ class _Descent:
         rule = self.problem.weight
         if rule is None or place.accepted < UNTIL_WEIGHT or not place.moved:
             return place
-        white = whiteness(now.images, self.problem.misfit)
+        white = rule.white(now.images, self.problem.misfit)
         past = place.records or (record(0, place.weight, "by the contrast"),)
         weight, reason = rule.next(
-            past, now.misfit, place.before, white, EDGE * place.scale / self.problem.setup.dilution
+            past, now.heeded, place.before, white, EDGE * place.scale / self.problem.setup.dilution
         )
-        made = record(number + 1, weight, reason, now.misfit, white)
+        made = record(number + 1, weight, reason, now.heeded, white)
         return replace(place, weight=weight, records=(*place.records, made))
 
     def advanced(
@@ -416,12 +418,12 @@ class _Descent:
         still = place.still + 1 if -actual < STILL * objective and self.steady(place, number) else 0
         if share < BAD and -predicted < STILL * objective:
             # the place is the minimum with these weights: it counts as reached, so that the weights go on
-            onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.misfit)
+            onward = replace(place, split=split, moved=True, accepted=place.accepted + 1, before=now.heeded)
             return replace(onward, still=still), now
         if share < BAD:
             there = self.judged(formed)
             return self.taken_back(replace(place, pairs=self.remembered(place, now, there, step))), now
-        onward = replace(onward, accepted=place.accepted + 1, before=now.misfit, moved=True, still=still)
+        onward = replace(onward, accepted=place.accepted + 1, before=now.heeded, moved=True, still=still)
         there, onward = self.renewed(onward, formed, *drafted)
         pairs, rise = self.remembered(place, now, there, step), there.misfit - now.misfit + penalties
         if rise > CREEP * objective:

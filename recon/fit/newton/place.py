@@ -29,8 +29,9 @@ class Place:
     resumed descent makes again. split: of the last model. correction: of the draft images.
     weight: of the priors. scale: the specimen's contrast, at first that of a linear estimate. known: whether the priors
     know it. width: of edges, over the last one. misled: whether few directions mislead here, so that each step has all.
-    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit one accepted step
-    earlier. moved: whether the last step was accepted. still: accepted steps in a row that changed next to nothing.
+    damping: λ over the Hessian's mean. accepted: number of steps that were. before: the misfit by which the weight
+    goes, one accepted step earlier. moved: whether the last step was accepted. still: accepted steps in a row that
+    changed next to nothing.
     pairs: for the secants. records: of the weight.
     """
 
@@ -79,9 +80,10 @@ class Formed:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A volume's misfit, its gradient, and the recorded images of the model."""
+    """A volume's misfit, that by which the priors' weight goes, the gradient, and the recorded images of the model."""
 
     misfit: float
+    heeded: float
     gradient: Float[Tensor, "z y x"]
     images: Float[Tensor, "prism focus row column"]
 
