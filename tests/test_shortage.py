@@ -1,5 +1,6 @@
 """Memory that runs out although there seemed to be room: one line says so, and on a GPU batches are halved once."""
 
+import errno
 import tracemalloc
 from dataclasses import replace
 
@@ -31,7 +32,7 @@ from torchdic import (
     image,
 )
 from torchdic.files.stack import write_stack, write_volume
-from torchdic.memory import free
+from torchdic.memory import free, shortage
 from torchdic.memory.held import course_of, most
 from torchdic.memory.shortage import as_shortage, halved_once, is_shortage
 
@@ -132,6 +133,15 @@ def test_every_kind_of_shortage_is_known_and_told_in_one_line():
         assert as_shortage(other) is other
     # of a library that is first used where there is no room for it
     assert is_shortage(ImportError("_lsprof.so: failed to map segment from shared object"))
+    assert is_shortage(OSError(errno.ENOMEM, "Cannot allocate memory", "torch/distributed"))
+    assert not is_shortage(OSError(errno.ENOSPC, "No space left on device", "out"))
+
+
+@pytest.mark.parametrize(("free", "short"), [(1 << 20, True), (1 << 30, False), (None, False)])
+def test_what_python_cannot_say_is_a_shortage_only_where_next_to_nothing_is_free(monkeypatch, free, short):
+    monkeypatch.setattr(shortage, "free_bytes", lambda device: free)
+    assert is_shortage(SystemError("error return without exception set")) is short
+    assert not is_shortage(SystemError("bad argument to internal function"))
 
 
 def test_the_processs_own_limit_is_free_memory_too(tmp_path):

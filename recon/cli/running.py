@@ -67,6 +67,8 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)
     except OSError as error:
+        if is_shortage(error):
+            return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)
         if error.errno not in OF_NAMES or error.filename is None:
             raise
         return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
@@ -81,7 +83,7 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
-    except (MemoryError, RuntimeError, ImportError) as error:
+    except (MemoryError, RuntimeError, ImportError, SystemError) as error:
         if not is_shortage(error):
             raise
         return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)

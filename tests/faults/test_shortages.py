@@ -26,8 +26,9 @@ FORESEEN = {
     "simulate, exact": ("[simulation]\nexact = true\n", 112, f"Images from the exact field on 640×640 pixels {NEED}"),
     "plan, of a stack": ("", 112, f"A volume of 8×320×320 voxels by method 'linear' {NEED}"),
     "calibrate": ("", 48, "the memory ran out"),
-    "reconstruct": ("", 160, f"Steps of a reconstruction of 8×320×320 voxels {NEED}"),
-    # its tiles would have room, its results have none
+    "reconstruct": ('tiles = "none"\n', 160, f"Steps of a reconstruction of 8×320×320 voxels {NEED}"),
+    # their tiles would have room, their results have none
+    "reconstruct, in tiles": ("", 160, f"Pictures and files of the results {NEED}"),
     "reconstruct, planned": ("", 160, f"Pictures and files of the results {NEED}"),
     "reconstruct, linear": ('method = "linear"\n', 160, f"A volume of 8×320×320 voxels by method 'linear' {NEED}"),
     "reconstruct, opl": ('method = "opl"\n', 96, f"Pictures and files of the results {NEED}"),

@@ -1,5 +1,6 @@
 """Where an allocation fails although there seemed to be room: how that is known, what is said, and a second try."""
 
+import errno
 import re
 import traceback
 import warnings
@@ -10,7 +11,7 @@ import torch
 
 from torchdic.errors import ShortageWarning, ShortOfMemoryError
 from torchdic.memory.batches import are_halved, halved_batches
-from torchdic.memory.free import GIB, LESS
+from torchdic.memory.free import GIB, LESS, free_bytes
 
 T = TypeVar("T")
 
@@ -18,15 +19,25 @@ T = TypeVar("T")
 _ASKED = re.compile(r"allocate ([\d.]+) (\w+)")
 
 
+# What Python says where its own code has found no room for an exception, and bytes that are free then at most.
+_NOTHING_SAID, _NOTHING_FREE = "without exception set", 64 << 20
+
+
 def is_shortage(error: BaseException) -> bool:
     """Whether an error says that memory ran out: Python's, NumPy's, or torch's, which on the CPU is a RuntimeError.
 
-    torch loads some of its libraries when they are first used: where there is no room for one, that is an ImportError.
+    torch loads some of its libraries when they are first used: where there is no room for one, that is an ImportError,
+    and where there is none to look for it, the system's. With next to nothing free Python may not even say what failed.
     """
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error)
+    if isinstance(error, OSError):
+        return error.errno == errno.ENOMEM
+    if isinstance(error, SystemError):
+        free = free_bytes(torch.device("cpu"))
+        return _NOTHING_SAID in str(error) and free is not None and free < _NOTHING_FREE
     return isinstance(error, RuntimeError) and "can't allocate memory" in str(error)
 
 
