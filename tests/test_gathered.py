@@ -145,13 +145,60 @@ def test_the_file_that_a_stack_of_settings_and_planes_lacks_is_named(tmp_path):
         gather([twice])
 
 
-@pytest.mark.parametrize("name", [lambda _, p: f"z{p - 6}.tif", lambda _, p: f"z{p / 2 - 3:+.1f}um.tif"])
-def test_numbers_with_signs_or_decimals_are_said_to_count_no_planes(tmp_path, name):
-    folder = planes(tmp_path / "planes", name, STACK[:1])
+# names of the planes, and the focus step in µm that they say
+DEPTHS = {
+    "signs": (lambda s, p: f"z{p - 6}.tif", None),
+    "signs and decimals": (lambda s, p: f"z{p / 2 - 3:+.1f}um.tif", 0.5),
+    "a dash for minus": (lambda s, p: f"z {p - 6} µm.tif".replace("-", "−"), 1.0),
+    "commas": (lambda s, p: f"cell_focus={p * 0.25:.2f} micron.tif".replace("0.", "0,").replace("1.", "1,"), 0.25),
+    "decimals of unlike length": (lambda s, p: f"depth{p / 4:g}um.ome.tif", 0.25),
+    "nanometres": (lambda s, p: f"z{300 * p}nm.tif", 0.3),
+    "rounded": (lambda s, p: f"z{p / 3:.1f}um.tif", 3.7 / 11),
+    "hyphens": (lambda s, p: f"z-{p + 1}.tif", None),
+    "sections": (lambda s, p: f"z1.{p + 1}.tif", None),
+    "a time without a unit of length": (lambda s, p: f"t{p}s.tif", None),
+}
+
+
+@pytest.mark.parametrize("case", DEPTHS)
+def test_depths_in_names_may_have_signs_decimals_and_a_unit(tmp_path, case):
+    name, step = DEPTHS[case]
+    stack = gather([planes(tmp_path / "planes", name, STACK[:1])]).stack
+    assert np.array_equal(stack.data, STACK[:1])
+    assert stack.focus_step == pytest.approx(step)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda s, p: f"{('minus', 'plus')[s]}_z{p - 6:+}.tif",
+        lambda s, p: f"bias-{s}_z{p / 2 - 3:.1f}um.tif",
+        lambda s, p: f"bias{('-', '+')[s]}90_z{p / 2 - 3:+.1f}um.tif",
+        lambda s, p: f"z{p} bias={(22.5, 67.5)[s]} deg.tif",
+        lambda s, p: f"{p}_shear{s - 1}.tif",
+    ],
+)
+def test_settings_are_told_beside_planes_also_by_signs(tmp_path, name):
+    assert np.array_equal(gather([planes(tmp_path / "planes", name)]).stack.data, STACK)
+
+
+def test_depths_that_say_too_little_are_told(tmp_path):
+    below = planes(tmp_path / "below", lambda _, p: f"z-{p / 2 + 0.5:.1f}um.tif", STACK[:1])
     with pytest.raises(
-        StackError, match=r"are of one setting and plane: signs and decimals aren't read, so name planes z1"
+        StackError, match=r"a minus or a hyphen stands before the depths of all names \(z-0\.5um\.tif, "
     ):
-        gather([folder])
+        gather([below])
+    elsewhere = planes(tmp_path / "elsewhere", lambda _, p: f"at{p - 6}.tif", STACK[:1])
+    with pytest.raises(StackError, match=r"of one setting and plane: signs and decimals are read only after z, plane"):
+        gather([elsewhere])
+    gap = planes(tmp_path / "gap", lambda _, p: f"z{p / 2 - 3:+.1f}um.tif", STACK[:1])
+    (gap / "z-1.5um.tif").unlink()
+    with pytest.warns(StackWarning, match=r"z-2\.0um\.tif and z-1\.0um\.tif are further apart than other planes"):
+        gather([gap])
+    lacking = planes(tmp_path / "lacking", lambda s, p: f"c{s}_z{p - 6}.tif")
+    (lacking / "c1_z-2.tif").unlink()
+    with pytest.raises(StackError, match=r"23 files are not 2 settings × 12 planes: c1_z-2\.tif is missing"):
+        gather([lacking])
 
 
 def test_a_plane_that_the_names_leave_out_is_warned_of(tmp_path):

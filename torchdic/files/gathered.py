@@ -1,16 +1,14 @@
 """A stack that lies in several files: a folder of planes, a file for each plane, or a file for each prism setting."""
 
 import os
-import re
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from torchdic.errors import StackError, StackWarning
+from torchdic.errors import StackError
+from torchdic.files.arrangement.names import natural, places_by_name
 from torchdic.files.described.setup import StatedSetup, setup_in_words, setup_of_all
 from torchdic.files.format import Stack
 from torchdic.files.joined import check_alike
@@ -21,15 +19,6 @@ _METADATA = "metadata.txt"
 
 # As many files are named one by one.
 _FEW = 3
-
-# What a file's name is made of: numbers and words.
-_PART = r"\d+|[^\W\d_]+"
-# A number with a sign or decimals, which counts no planes.
-_SIGNED = r"[-+−]\d|\d[.,]\d"
-
-# Letters before a number in a file's name, by which it counts planes or prism settings.
-_OF_PLANES = ("z", "plane", "planes", "slice", "focus", "depth", "t", "time")
-_OF_PRISMS = ("c", "ch", "channel", "w", "setting", "prism", "bias", "shear", "frame")
 
 
 @dataclass(frozen=True)
@@ -57,8 +46,9 @@ def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
     paths: prism settings are in this order; those of a folder in the natural order of the files' names.
     series: as for `read_stack`; of each file.
 
-    Files of one plane each are the planes, in the order of the one number in their names that changes. Where two do,
-    such as c1 and z03, or a word does, one counts the prism settings. Files of several planes are a prism setting each.
+    Files of one plane each are the planes, in the order of the one number in their names that changes, such as z-0.5um.
+    Where two do, such as c1 and z03, or a word does, one counts the prism settings. Files of several planes are a prism
+    setting each.
     Raises StackError for no file, one that is named twice, a folder without images, files of different shapes or
     dtypes, and names from which no order follows, and as `read_stack` does.
     """
@@ -72,10 +62,11 @@ def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
         return Gathered(_with_sizes(stacks[0], said), files, said)
     check_alike(stacks, settings=True)
     if stacks[0].data.shape[:2] == (1, 1):
-        prisms, planes = _layout(files, typed=folder is None)
-        order = np.array(sorted(range(len(files)), key=lambda i: (prisms[i], planes[i])))
+        places = places_by_name(files, typed=folder is None)
+        order = np.lexsort((places.planes, places.settings))
         data = np.stack([stacks[i].data[0, 0] for i in order])
-        data = data.reshape(len(set(prisms)), -1, *data.shape[1:])
+        data = data.reshape(len(set(places.settings)), -1, *data.shape[1:])
+        said = said.completed(StatedSetup(focus_step=places.step))
         names = [_span([files[i] for i in part]) for part in np.split(order, len(data))]
     else:
         order, data = np.arange(len(files)), np.concatenate([stack.data for stack in stacks])
@@ -84,11 +75,6 @@ def gather(paths: Sequence[Path], series: int | None = None) -> Gathered:
         ]
     joined = replace(stacks[0], data=data, names=tuple(names), source=_source(files, folder))
     return Gathered(_with_sizes(joined, said), tuple(files[i] for i in order), said)
-
-
-def natural(name: str) -> list[tuple[int, int, str]]:
-    """The key by which plane2 comes before plane10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in re.split(r"(\d+)", name) if part]
 
 
 def _source(files: Sequence[Path], folder: Path | None) -> str:
@@ -157,103 +143,3 @@ def _with_sizes(stack: Stack, said: StatedSetup) -> Stack:
         focus_step=stack.focus_step or (said.focus_step if stack.data.shape[1] > 1 else None),
         bits=stack.bits or (said.bits if fits else None),
     )
-
-
-def _layout(files: Sequence[Path], *, typed: bool) -> tuple[list[int], list[int]]:
-    """Which prism setting and which plane each file is, by what changes in their names.
-
-    typed: whether the settings are in the order of the files, not in the natural order of their names.
-    """
-    parts = [_parts(file) for file in files]
-    if len({tuple(part.isdigit() for part in name) for name in parts}) > 1:
-        raise StackError(f"{files[0].parent}: the names differ in more than numbers and words: {_two(files)}")
-    changing = [i for i in range(len(parts[0])) if len({name[i] for name in parts}) > 1]
-    prism = next((i for i in changing if _counts(parts[0], i, _OF_PRISMS)), None)
-    if prism is None and len(changing) == 1 and not parts[0][changing[0]].isdigit():
-        prism = changing[0]  # a word alone, such as plus and minus
-    if prism is None and len(changing) == 2:
-        words = [i for i in changing if not parts[0][i].isdigit()]
-        of_planes = [i for i in changing if _counts(parts[0], i, _OF_PLANES)]
-        prism = next(iter([*words, *(i for i in changing if of_planes and i not in of_planes)]), None)
-    planes = [i for i in changing if i != prism]
-    if len(planes) > 1:
-        raise StackError(
-            f"{files[0].parent}: {len(changing)} parts of the names change ({_two(files)}): name prism settings "
-            "channel1, channel2, … and planes z1, z2, …"
-        )
-    of_prisms, of_planes = (
-        [natural(name[i[0]]) if i else [] for name in parts] for i in ([] if prism is None else [prism], planes)
-    )
-    settings, depths = list(dict.fromkeys(tuple(v) for v in of_prisms)), sorted({tuple(v) for v in of_planes})
-    settings = settings if typed else sorted(settings)
-    places = [(settings.index(tuple(v)), depths.index(tuple(d))) for v, d in zip(of_prisms, of_planes, strict=True)]
-    if len(settings) * len(depths) != len(files):
-        raise StackError(
-            f"{files[0].parent}: {len(files)} files are not {len(settings)} settings × {len(depths)} planes: "
-            f"{_lacking(files, places, prism)}"
-        )
-    if planes:
-        _warn_of_a_gap(files, planes[0])
-    return [setting for setting, _ in places], [depth for _, depth in places]
-
-
-def _lacking(files: Sequence[Path], places: Sequence[tuple[int, int]], prism: int | None) -> str:
-    """The names of the files that a rectangle of settings and planes lacks, or of two files at one place of it.
-
-    places: (setting, plane) of each file. prism: which part of the names tells the settings; None is none, of one.
-    """
-    at: dict[tuple[int, int], Path] = {}
-    for file, place in zip(files, places, strict=True):
-        if place in at:
-            signed = re.search(_SIGNED, file.stem) is not None
-            hint = ": signs and decimals aren't read, so name planes z1, z2, …" if signed else ""
-            return f"{at[place].name} and {file.name} are of one setting and plane{hint}"
-        at[place] = file
-    settings, depths = ({place[i]: file for place, file in at.items()} for i in (0, 1))
-    names = [
-        _renamed(depths[depth], prism, _parts(settings[setting])[prism])
-        for setting in sorted(settings)
-        for depth in sorted(depths)
-        if prism is not None and (setting, depth) not in at
-    ]
-    many = " and others" if len(names) > 3 else ""
-    return f"{', '.join(names[:3])}{many} {'is' if len(names) == 1 else 'are'} missing"
-
-
-def _warn_of_a_gap(files: Sequence[Path], index: int) -> None:
-    """Warn StackWarning where the numbers that count planes leave one out. index: of the part of the names."""
-    numbered = {int(part): file for file in files if (part := _parts(file)[index]).isdigit()}
-    numbers = sorted(numbered)
-    steps = [b - a for a, b in pairwise(numbers)]
-    wide = next((i for i, step in enumerate(steps) if step > min(steps)), None)
-    if wide is None:
-        return
-    before, after = numbered[numbers[wide]], numbered[numbers[wide + 1]]
-    lacking = numbers[wide] + min(steps)
-    name = _renamed(before, index, str(lacking).zfill(len(_parts(before)[index])))
-    warnings.warn(
-        f"{files[0].parent}: {name} is missing between {before.name} and {after.name}; the planes are taken as equally "
-        "spaced without it",
-        StackWarning,
-        stacklevel=4,
-    )
-
-
-def _parts(file: Path) -> list[str]:
-    """The numbers and the words of a file's name."""
-    return re.findall(_PART, file.stem)
-
-
-def _renamed(file: Path, index: int, part: str) -> str:
-    """The name of a file with another part in a place."""
-    place = list(re.finditer(_PART, file.stem))[index]
-    return f"{file.stem[: place.start()]}{part}{file.stem[place.end() :]}{file.suffix}"
-
-
-def _counts(name: Sequence[str], index: int, words: Sequence[str]) -> bool:
-    """Whether the number at this place follows one of the words."""
-    return name[index].isdigit() and index > 0 and name[index - 1].lower() in words
-
-
-def _two(files: Sequence[Path]) -> str:
-    return f"{files[0].name}, {files[-1].name}"
