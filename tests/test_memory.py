@@ -175,6 +175,7 @@ def test_a_learned_background_of_a_field_is_foreseen(monkeypatch):
     assert run(whole * 6 // 10) < 0.8 * whole
 
 
+@pytest.mark.slow
 def test_steps_that_an_adaptive_solver_ignores_change_no_estimate(specimen):
     few, many = (
         foreseen(specimen(), SCOPE, ACQUISITION, Fidelity("rays", solver="dopri5", steps=steps))

@@ -308,6 +308,7 @@ def test_right_equation_9_is_fermats_and_the_printed_one_is_not(slope):
 # --- other solvers -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_adaptive_solver_meets_its_tolerance_on_a_few_hard_rays_among_many(monkeypatch):
     """Every single ray counts: 3 meet a steep small ball, 600 pass at its side.
 
