@@ -157,6 +157,7 @@ DEPTHS = {
     "hyphens": (lambda s, p: f"z-{p + 1}.tif", None),
     "sections": (lambda s, p: f"z1.{p + 1}.tif", None),
     "a time without a unit of length": (lambda s, p: f"t{p}s.tif", None),
+    "a time of more digits than a float has": (lambda s, p: f"t{20261129123456789000 + p}.tif", None),
 }
 
 

@@ -66,12 +66,6 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
             _leave_index(options)
     except WRONG as error:
         return _fail(str(error), BAD_INPUT)
-    except OSError as error:
-        if is_shortage(error):
-            return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)
-        if error.errno not in OF_NAMES or error.filename is None:
-            raise
-        return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
     except TurnedRaysError as error:
         return _fail(f"{_input(options)}{error}; the wave may cross it", BAD_INPUT)
     except (UnstableError, SidewaysError) as error:
@@ -83,10 +77,12 @@ def run(command: Callable[[argparse.Namespace], None], options: argparse.Namespa
         return _fail(str(error), FAILED)
     except (InterruptedRunError, KeyboardInterrupt) as error:
         return _fail(str(error) or "interrupted", INTERRUPTED)
-    except (MemoryError, RuntimeError, ImportError, SystemError) as error:
-        if not is_shortage(error):
-            raise
-        return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)
+    except (OSError, MemoryError, RuntimeError, ImportError, SystemError) as error:
+        if is_shortage(error):
+            return _fail(f"{_input(options)}{as_shortage(error)}", BAD_INPUT)
+        if isinstance(error, OSError) and error.errno in OF_NAMES and error.filename is not None:
+            return _fail(f"{error.filename}: {error.strerror}", BAD_INPUT)
+        raise
     return 0
 
 

@@ -18,7 +18,6 @@ T = TypeVar("T")
 # How torch and NumPy say what they asked for.
 _ASKED = re.compile(r"allocate ([\d.]+) (\w+)")
 
-
 # What Python says where its own code has found no room for an exception, and bytes that are free then at most.
 _NOTHING_SAID, _NOTHING_FREE = "without exception set", 64 << 20
 

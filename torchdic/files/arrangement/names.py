@@ -218,7 +218,8 @@ def _key(part: str) -> list[tuple[int, float, str]]:
 
 
 def _number(part: str) -> float:
-    return float(part.replace("−", "-").replace(",", "."))
+    """The value of a number: a whole one is exact, however many digits a time has."""
+    return int(part) if part.isdecimal() else float(part.replace("−", "-").replace(",", "."))
 
 
 def _two(files: Sequence[Path]) -> str:
