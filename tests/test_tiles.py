@@ -224,16 +224,15 @@ def test_tiles_make_the_volume_that_the_whole_field_makes(field):
     assert distance(found, truth) < 1.1 * distance(last.delta, truth)
 
 
-def test_other_tiles_hold_what_the_first_has_found(field):
+def test_other_tiles_take_over_what_the_first_has_found(field):
     whole, _ = field
     layout = layout_of(FIELD, 40, 5, 10)
     first, second = strongest_first(layout, whole.misfit)
-    shared = SharedByTiles(whole.misfit, 70.0, 0.012, {"brightness": torch.full((2, 3), 1.02)})
+    shared = SharedByTiles(whole.misfit, 70.0, 40.0, 0.012, {"brightness": torch.full((2, 3), 1.02)})
     problem = problem_of_tile(whole, layout, second, [NOISE] * 2, shared)
     assert [unknown.name for unknown in problem.unknowns] == ["delta"]
     assert problem.weight is not None
-    assert problem.weight.held
-    assert (problem.weight.first, problem.contrast) == (70.0, 0.012)
+    assert (problem.weight.first, problem.weight.towards, problem.contrast) == (40.0, 70.0, 0.012)
     assert torch.equal(problem.setup.brightness, shared.values["brightness"])
     assert torch.equal(problem.misfit.variance, whole.misfit.variance)
     own = problem_of_tile(whole, layout, first, [NOISE] * 2)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from recon.misfit.gaussian import GaussianMisfit
-from recon.prior.weight import LEAST, MODEL, MOST, TWICE, USUAL, FollowsNoise, reach, record, whiteness
+from recon.prior.weight import FARTHER, LEAST, MODEL, MOST, TWICE, USUAL, FollowsNoise, reach, record, whiteness
 
 NOISE = 0.2
 RULE = FollowsNoise(NOISE, 10**9)
@@ -67,6 +67,16 @@ def test_it_holds_while_the_misfit_still_falls():
     assert following(0.9, before=1.0) == (10.0, "the misfit still falls")
     assert following(0.9, before=0.91)[1] != "the misfit still falls"
     assert following(0.9)[1] != "the misfit still falls"  # the first one tells nothing
+
+
+def test_a_weight_that_is_known_is_approached_whatever_the_noise():
+    rule, weights = FollowsNoise(NOISE, 10**9, first=10.0, towards=40.0), [10.0]
+    for misfit in (0.9, 0.1, NOISE):
+        weights.append(following(misfit, before=1.0, rule=rule, weights=weights)[0])
+    assert all(before < after < 40.0 for before, after in pairwise(weights))
+    distances = [math.log(40.0 / weight) for weight in weights]
+    assert [after / before for before, after in pairwise(distances)] == pytest.approx([FARTHER] * 3)
+    assert following(0.9, rule=rule, weights=[40.0])[0] == 40.0
 
 
 def test_where_the_noise_is_not_known_the_residual_becomes_white():

@@ -43,6 +43,10 @@ FALLING = 0.03
 # Above SEEN the priors may still hide the specimen altogether.
 BEYOND, LEFT, SEEN = 1.2, 0.75, 0.25
 
+# Each move leaves this part of the way to a weight that is known from elsewhere, in logarithms. The way shows in the
+# volume: with the last weight at once it is another one than that of a fit whose weight was lower at first.
+FARTHER = 0.7
+
 # Frequencies above this many cycles per pixel, along y or x, are high.
 HIGH = 0.35
 
@@ -80,7 +84,7 @@ class FollowsNoise:
     the residual alone tells it. pixels: of all images, that count. first: the weight at first; None is chosen by the
     specimen's contrast. held: whether the weight stays as it is, as where other images are fitted in the same way.
     inside: the part of the images that misfit and pixels are of, where the others show what the volume can't explain;
-    None is all.
+    None is all. towards: a weight known from elsewhere, to which this one goes whatever the noise; None is none.
     """
 
     noise_misfit: float | None
@@ -88,6 +92,7 @@ class FollowsNoise:
     first: float | None = None
     held: bool = False
     inside: Inside | None = None
+    towards: float | None = None
 
     def heeded(self, images: Float[Tensor, "prism focus y x"], value: float) -> float:
         """The misfit by which the weight goes. images: the model's. value: of the misfit of them all."""
@@ -124,6 +129,8 @@ class FollowsNoise:
         weight = weights[-1]
         if self.held:
             return weight, "held"
+        if self.towards is not None:
+            return self.towards * (weight / self.towards) ** FARTHER, "on its way to one that is known"
         aim = self.aim(misfit, white, weight * width / USUAL)
         if before is not None and misfit < (1 - FALLING) * before and misfit > aim:
             return weight, "the misfit still falls"

@@ -28,22 +28,25 @@ from recon.tiling.layout import Layout, Span, Tile
 class SharedByTiles:
     """What the first tile's fit says of all tiles.
 
-    misfit: whose scale is that of all. weight: of the priors, where it follows the noise. contrast: of the specimen.
-    values: of what was learned beside Δn, by name, but for the lamp: an uneven one is another one in each tile.
+    misfit: whose scale is that of all. weight: of the priors, where it follows the noise. least: what it was at least
+    on its way. contrast: of the specimen. values: of what was learned beside Δn, by name, but for the lamp: an uneven
+    one is another one in each tile.
     """
 
     misfit: Misfit
     weight: float | None
+    least: float | None
     contrast: float
     values: dict[str, Tensor]
 
     @classmethod
     def by(cls, problem: Problem, last: Step) -> "SharedByTiles":
         """What a tile's finished fit says. problem: its own. last: its last step."""
-        weight = last.weights[-1]["tv"] if problem.weight is not None and last.weights else None
+        weights = [record["tv"] for record in last.weights] if problem.weight is not None else []
         own = {u.name for u in problem.unknowns if _is_of_tile(u)}
         values = {name: value for name, value in last.values.items() if name not in own}
-        return cls(problem.misfit, weight, contrast(last.delta), values)
+        found, least = (weights[-1], min(weights)) if weights else (None, None)
+        return cls(problem.misfit, found, least, contrast(last.delta), values)
 
 
 def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:
@@ -124,9 +127,10 @@ def _inside(misfit: Misfit, layout: Layout, tile: Tile) -> Inside | None:
 def _weight(
     whole: Problem, tile: Problem, inside: Inside | None, noise: Sequence[float] | None, shared: SharedByTiles | None
 ) -> FollowsNoise:
-    """The common factor of a tile's priors: found by the first tile, from what is inside it, and held by the others.
+    """The common factor of a tile's priors: found by the first tile, from what is inside it.
 
-    Where the weights are given, they are those of the whole field without a margin.
+    The others go there from the least of its way, as they would in a fit of the whole. Where the weights are given,
+    they are those of the whole field without a margin.
     """
     misfit = tile.misfit if inside is None else inside.misfit
     pixels = int(misfit.pixels.sum())
@@ -135,7 +139,7 @@ def _weight(
     known = misfit.of_noise(noise) if misfit.knows_all and noise is not None else None
     if shared is None:
         return replace(whole.weight, noise_misfit=known, pixels=pixels, inside=inside)
-    return FollowsNoise(known, pixels, shared.weight, held=True)
+    return FollowsNoise(known, pixels, shared.least, towards=shared.weight)
 
 
 def _counting(mask: Bool[Tensor, "prism focus y x"]) -> Bool[Tensor, " prism"]:

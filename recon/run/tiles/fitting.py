@@ -127,8 +127,14 @@ class TiledFit:
 
     def identity_of(self, tile: Tile) -> str:
         """What a tile's fit depends on."""
-        shared = "" if tile == self.tiles[0] else f"weight {self.shared.weight}, contrast {self.shared.contrast}"
-        return identity_of(self.identity, self.layout, tile, self.whole.steps, shared)
+        return identity_of(self.identity, self.layout, tile, self.whole.steps, self._taken_over_by(tile))
+
+    def _taken_over_by(self, tile: Tile) -> str:
+        """What a tile takes over from the first one, in words; none of the first itself."""
+        if tile == self.tiles[0]:
+            return ""
+        shared = self.shared
+        return f"weight {shared.least} to {shared.weight}, contrast {shared.contrast}"
 
     @cached_property
     def shared(self) -> SharedByTiles:
