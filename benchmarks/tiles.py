@@ -1,6 +1,6 @@
 """A field fitted in tiles beside the same field fitted whole: how far apart they are, at the seams too, and the cost.
 
-    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...] [--pixels 288]
+    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...] [--pixels 288] [--steps 20]
 
 Images come from a finer model than the fits', with noise (`scenes.py`). Each field has specimens on its seams. "apart"
 is the distance of the two volumes over the whole fit's length, "at seams" the same of the voxels in which two tiles are
@@ -179,10 +179,10 @@ def draw(name: str, whole: Fit, tiles: Fit, layout: Layout, path: Path) -> None:
     plt.close(figure)
 
 
-def row(name: str, scene: scenes.Scene, layout: Layout, out: Path) -> str:
-    """Fit a scene both ways, draw it, and return its row."""
+def row(name: str, scene: scenes.Scene, layout: Layout, out: Path, steps: int | None) -> str:
+    """Fit a scene both ways, in so many steps at most, draw it, and return its row."""
     setup = Setup(empty_medium(scene.grid, scene.background, scene.data), scene.microscope, scene.acquisition)
-    recipe = Recipe(bounds=Bounds(*scene.bounds))
+    recipe = Recipe(steps=steps, bounds=Bounds(*scene.bounds))
     problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, GaussianMisfit, scene.noise)
     whole, tiles = fitted_whole(problem), fitted_in_tiles(problem, layout, scene.noise)
     draw(name, whole, tiles, layout, out / f"{name.replace(' ', '_')}.png")
@@ -211,6 +211,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("tiles"))
     parser.add_argument("--scenes", nargs="+", choices=names, default=names)
     parser.add_argument("--pixels", type=int, default=288, help="of the field along a side")
+    parser.add_argument("--steps", type=int, help="of each fit at most")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")
@@ -220,7 +221,7 @@ def main() -> None:
     print(f"{len(layout)} tiles of {side} voxels, margin {margin}, overlap {SHARED} of {field.shape}\n{HEAD}")
     for name in options.scenes:
         scene = setups(field)[name].scene(name, options.out / "cache")
-        print(row(name, scene, layout, options.out), flush=True)
+        print(row(name, scene, layout, options.out, options.steps), flush=True)
 
 
 if __name__ == "__main__":

@@ -233,6 +233,9 @@ def test_other_tiles_take_over_what_the_first_has_found(field):
     assert [unknown.name for unknown in problem.unknowns] == ["delta"]
     assert problem.weight is not None
     assert (problem.weight.first, problem.weight.towards, problem.contrast) == (40.0, 70.0, 0.012)
+    assert not problem.weight.held
+    none_found = replace(shared, weight=None, least=None)
+    assert problem_of_tile(whole, layout, second, [NOISE] * 2, none_found).weight.held
     assert torch.equal(problem.setup.brightness, shared.values["brightness"])
     assert torch.equal(problem.misfit.variance, whole.misfit.variance)
     own = problem_of_tile(whole, layout, first, [NOISE] * 2)

@@ -129,8 +129,8 @@ def _weight(
 ) -> FollowsNoise:
     """The common factor of a tile's priors: found by the first tile, from what is inside it.
 
-    The others go there from the least of its way, as they would in a fit of the whole. Where the weights are given,
-    they are those of the whole field without a margin.
+    The others go there from the least of its way, as they would in a fit of the whole; where it took too few steps to
+    find one, theirs stays as it begins. Weights that are given are those of the whole field without a margin.
     """
     misfit = tile.misfit if inside is None else inside.misfit
     pixels = int(misfit.pixels.sum())
@@ -139,7 +139,7 @@ def _weight(
     known = misfit.of_noise(noise) if misfit.knows_all and noise is not None else None
     if shared is None:
         return replace(whole.weight, noise_misfit=known, pixels=pixels, inside=inside)
-    return FollowsNoise(known, pixels, shared.least, towards=shared.weight)
+    return FollowsNoise(known, pixels, shared.least, held=shared.weight is None, towards=shared.weight)
 
 
 def _counting(mask: Bool[Tensor, "prism focus y x"]) -> Bool[Tensor, " prism"]:
