@@ -22,6 +22,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("runs")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_each_file_of_a_folder_is_explained(folder, monkeypatch):
     monkeypatch.chdir(folder)

@@ -62,6 +62,7 @@ def wait_until(what):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_two_processes_find_the_error_bars_of_one(bead, capsys):
     few = ["error-bars", "one", "--refits", "2", "--copies", "2"]
     assert main(few) == 0

@@ -481,6 +481,7 @@ def test_tiles_of_another_run_are_not_gone_on_with(workplace, tmp_path, monkeypa
     assert "layout.json: can't be read" in err
 
 
+@pytest.mark.slow
 def test_a_run_by_tiles_in_place_of_a_whole_one_leaves_nothing_of_that(workplace, tmp_path):
     out, other = tmp_path / "out", workplace / "uncut.toml"
     other.write_text(CONFIG.replace("tiles = 25", "tiles = 'none'"), encoding="utf-8")
