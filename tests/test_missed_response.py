@@ -98,7 +98,6 @@ def test_it_is_left_out_where_it_has_no_room_and_where_no_direction_is_missing()
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_noise_is_not_fitted_at_frequencies_that_few_directions_alone_see(monkeypatch):
     """A dim stack: a fit errs as much with few directions as with all, but for what of the response it doesn't know."""
     delta, random = (2 * blob(0.01)).clamp(max=0.01), torch.Generator().manual_seed(4)
