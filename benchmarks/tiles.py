@@ -32,12 +32,14 @@ from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
 from recon.recording.cut_field import margin_beyond
 from recon.report.metrics import volume_error
+from recon.run.folder.prepared import prepare_folder
 from recon.run.reconstruct import RECOMMENDED
 from recon.run.room import bytes_held
+from recon.run.tiles.fitting import TiledFit
+from recon.run.tiles.kept import forget
 from recon.run.tiles.sizes import OVERLAP
-from recon.tiling.blending import blended_volume
 from recon.tiling.layout import Layout
-from recon.tiling.part import SharedByTiles, problem_of_tile, strongest_first
+from recon.tiling.part import strongest_first
 from specimens import GradedEllipsoid, Together, moved
 from torchdic import Grid
 
@@ -131,18 +133,16 @@ def fitted_whole(problem: Problem) -> Fit:
     return Fit(last.delta, weight_of(problem, last), seconds, bytes_held(problem, GaussianMisfit))
 
 
-def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...]) -> Fit:
-    """The field in tiles."""
-    shared, found, total, weight, largest = None, [], 0.0, 0.0, 0
-    for tile in strongest_first(layout, problem.misfit):
-        part = problem_of_tile(problem, layout, tile, noise, shared)
-        last, seconds = solved(part)
-        if shared is None:
-            shared = SharedByTiles.by(part, last)
-            weight, largest = weight_of(part, last), bytes_held(part, GaussianMisfit)
-        found.append((tile, last.delta))
-        total += seconds
-    return Fit(blended_volume(layout, SLICES, found), weight, total, largest)
+def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...], out: Path) -> Fit:
+    """The field in tiles, which are kept in a folder until they are all fitted."""
+    began, folder = time.process_time(), out / "kept"
+    fit = TiledFit(problem, layout, tuple(strongest_first(layout, problem.misfit)), noise, folder, "", problem.steps)
+    prepare_folder(folder)
+    tiled = fit.fitted()
+    first, last = tiled.first, tiled.ended.step
+    forget(folder)
+    seconds = time.process_time() - began
+    return Fit(last.delta, weight_of(first, last), seconds, bytes_held(first, GaussianMisfit))
 
 
 def seams(layout: Layout) -> Bool[Tensor, "y x"]:
@@ -184,7 +184,7 @@ def row(name: str, scene: scenes.Scene, layout: Layout, out: Path, steps: int | 
     setup = Setup(empty_medium(scene.grid, scene.background, scene.data), scene.microscope, scene.acquisition)
     recipe = Recipe(steps=steps, bounds=Bounds(*scene.bounds))
     problem = Problem.from_recipe(scene.data, setup, RECOMMENDED, recipe, GaussianMisfit, scene.noise)
-    whole, tiles = fitted_whole(problem), fitted_in_tiles(problem, layout, scene.noise)
+    whole, tiles = fitted_whole(problem), fitted_in_tiles(problem, layout, scene.noise, out)
     draw(name, whole, tiles, layout, out / f"{name.replace(' ', '_')}.png")
     at = seams(layout)
     columns = [

@@ -17,17 +17,23 @@ from test_reconstruct import command, content, interrupt_at, volume
 
 from recon.config.reading import load
 from recon.descend import Problem, Recipe, minimise
+from recon.fit.nuisances.light import Lamp
 from recon.fit.setup import Setup, empty_medium
+from recon.fit.step import Step
 from recon.misfit.gaussian import GaussianMisfit
 from recon.misfit.poisson import PoissonMisfit
 from recon.misfit.robust import RobustMisfit
+from recon.prior.base import contrast
+from recon.prior.weight import record
 from recon.recording.noise import NoiseModel
 from recon.run import recorded
 from recon.run.tiles import sizes
+from recon.run.tiles.fitting import TiledFit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
-from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first, without_margin
+from recon.tiling.part import gone_on_with, lacks, problem_of_tile, strongest_first, without_margin
+from recon.tiling.shared import LEADERS, Finding, LearnedByFirst, SharedPriors, leaders
 from torchdic import (
     Acquisition,
     Camera,
@@ -178,9 +184,9 @@ def scene():
     """Δn of three balls, one of which lies on the cut between two tiles."""
     z, y, x = (FIELD.coordinates(axis) for axis in range(3))
     delta = torch.zeros(FIELD.shape)
-    for cy, cx, radius, contrast in ((0.2, -3.4, 0.8, 0.02), (-0.3, 0.1, 0.9, 0.015), (0.1, 3.2, 0.7, 0.02)):
+    for cy, cx, radius, high in ((0.2, -3.4, 0.8, 0.02), (-0.3, 0.1, 0.9, 0.015), (0.1, 3.2, 0.7, 0.02)):
         distance = (z[:, None, None] ** 2 + (y[:, None] - cy) ** 2 + (x - cx) ** 2).sqrt()
-        delta = torch.maximum(delta, contrast * torch.sigmoid((radius - distance) / 0.06))
+        delta = torch.maximum(delta, high * torch.sigmoid((radius - distance) / 0.06))
     return delta
 
 
@@ -199,15 +205,10 @@ def solved(problem):
     return deque(minimise(problem), maxlen=1).pop()
 
 
-def fitted(whole, layout):
-    """The volume of the field, from fits of its tiles."""
-    shared, found = None, []
-    for tile in strongest_first(layout, whole.misfit):
-        problem = problem_of_tile(whole, layout, tile, [NOISE] * 2, shared)
-        last = solved(problem)
-        shared = shared or SharedByTiles.by(problem, last)
-        found.append((tile, last.delta))
-    return blended_volume(layout, FIELD.shape[0], found)
+def fitted(whole, layout, out):
+    """The field fitted tile by tile, with its tiles kept in a folder."""
+    tiles = tuple(strongest_first(layout, whole.misfit))
+    return TiledFit(whole, layout, tiles, [NOISE] * 2, out, "these tiles", whole.steps)
 
 
 def distance(found, other):
@@ -215,35 +216,106 @@ def distance(found, other):
 
 
 @pytest.mark.slow
-def test_tiles_make_the_volume_that_the_whole_field_makes(field):
+def test_tiles_make_the_volume_that_the_whole_field_makes(field, tmp_path):
     """The second ball is cut in two by the seam."""
     whole, truth = field
     last = solved(whole)
-    found = fitted(whole, layout_of(FIELD, 40, 5, 10))
-    assert distance(found, last.delta) < 0.03
-    assert distance(found, truth) < 1.1 * distance(last.delta, truth)
+    fit = fitted(whole, layout_of(FIELD, 40, 5, 10), tmp_path)
+    step = fit.fitted().ended.step
+    assert distance(step.delta, last.delta) < 0.03
+    assert distance(step.delta, truth) < 1.1 * distance(last.delta, truth)
+    # both tiles have led, and then they have gone by what they say together
+    assert [str(visit) for visit in [*fit.leading, *fit.following]] == ["1-1", "1-2", "1-1 again", "1-2 again"]
+    own = [fit.found(visit).step for visit in fit.leading]
+    assert len({each.weights[-1]["tv"] for each in own}) == 2
+    for visit in fit.last:
+        assert {each["tv"] for each in fit.found(visit).step.weights} == {fit.priors.weight}
+    assert step.weights[-1]["tv"] == fit.priors.weight
 
 
-def test_other_tiles_take_over_what_the_first_has_found(field):
+def learned_of(whole):
+    """What a first tile may say of a field."""
+    return LearnedByFirst(whole.misfit, {"brightness": torch.full((2, 3), 1.02)}, Finding(70.0, 40.0, 0.012, 1.0))
+
+
+def test_a_leader_finds_its_own_weight_and_takes_over_the_first_tiles_scale(field):
     whole, _ = field
     layout = layout_of(FIELD, 40, 5, 10)
     first, second = strongest_first(layout, whole.misfit)
-    shared = SharedByTiles(whole.misfit, 70.0, 40.0, 0.012, {"brightness": torch.full((2, 3), 1.02)})
-    problem = problem_of_tile(whole, layout, second, [NOISE] * 2, shared)
-    assert [unknown.name for unknown in problem.unknowns] == ["delta"]
-    assert problem.weight is not None
-    assert (problem.weight.first, problem.weight.towards, problem.contrast) == (40.0, 70.0, 0.012)
-    assert not problem.weight.held
-    none_found = replace(shared, weight=None, least=None)
-    assert problem_of_tile(whole, layout, second, [NOISE] * 2, none_found).weight.held
-    assert torch.equal(problem.setup.brightness, shared.values["brightness"])
-    assert torch.equal(problem.misfit.variance, whole.misfit.variance)
     own = problem_of_tile(whole, layout, first, [NOISE] * 2)
-    assert own.contrast is None
     assert len(own.unknowns) == len(whole.unknowns)
-    assert own.weight is not None
     # the tile's own noise, in the unit of its own variance
     assert own.weight.noise_misfit == pytest.approx(NOISE**2 / float(own.misfit.variance.mean()), rel=0.05)
+    learned = learned_of(whole)
+    leader = problem_of_tile(whole, layout, second, [NOISE] * 2, learned)
+    assert [unknown.name for unknown in leader.unknowns] == ["delta"]
+    assert torch.equal(leader.setup.brightness, learned.values["brightness"])
+    assert torch.equal(leader.misfit.variance, whole.misfit.variance)
+    for problem in (own, leader):
+        assert problem.contrast is None
+        assert problem.weight.inside is not None
+        assert (problem.weight.first, problem.weight.towards, problem.weight.held) == (None, None, False)
+
+
+def test_other_tiles_take_over_what_the_leaders_have_found(field):
+    whole, _ = field
+    layout = layout_of(FIELD, 40, 5, 10)
+    _, second = strongest_first(layout, whole.misfit)
+    learned, priors = learned_of(whole), SharedPriors(70.0, 40.0, 0.012)
+    problem = problem_of_tile(whole, layout, second, [NOISE] * 2, learned, priors)
+    assert [unknown.name for unknown in problem.unknowns] == ["delta"]
+    assert (problem.weight.first, problem.weight.towards, problem.contrast) == (40.0, 70.0, 0.012)
+    assert not problem.weight.held
+    none_found = SharedPriors(None, None, 0.012)
+    assert problem_of_tile(whole, layout, second, [NOISE] * 2, learned, none_found).weight.held
+
+
+def test_a_leader_goes_on_with_the_weight_and_the_contrast_of_all(field):
+    """From its own volume, and with its own lamp."""
+    whole, truth = field
+    whole = replace(whole, unknowns=[*whole.unknowns, Lamp()], steps=1)
+    layout = layout_of(FIELD, 40, 5, 10)
+    _, second = strongest_first(layout, whole.misfit)
+    learned, priors = learned_of(whole), SharedPriors(70.0, 40.0, 0.012)
+    problem = problem_of_tile(whole, layout, second, [NOISE] * 2, learned, priors)
+    delta = torch.nn.functional.pad(truth, (5, 5, 5, 5))[..., :50].clone()
+    lamp = torch.full((2, 5), 0.01)
+    last = replace(solved(problem), delta=delta, values={"delta": delta, "lamp": lamp})
+    again = gone_on_with(problem, last)
+    assert (again.weight.first, again.weight.held, again.contrast) == (70.0, True, 0.012)
+    assert torch.equal(again.unknowns[0].given, delta)
+    assert torch.equal(again.setup.lamp, lamp)
+    assert solved(again).state["newton"]["scale"] == 0.012
+
+
+def test_leaders_count_by_their_share_of_the_specimen():
+    """Δn² of a tile, whose contrast is Σ|Δn|³/Σ|Δn|²: that of all tiles is the mean by their squares."""
+    volumes = [0.02 * torch.rand(2, 6, 8, generator=generator(7)), 0.01 * torch.rand(2, 6, 8, generator=generator(8))]
+    steps = [
+        Step(9, 0.0, 0.0, delta, 0.0, {}, {}, (), (record(0, least, ""), record(9, weight, "")))
+        for delta, least, weight in zip(volumes, (10.0, 20.0), (40.0, 90.0), strict=True)
+    ]
+    findings = [Finding.by(step) for step in steps]
+    shared = SharedPriors.by(findings)
+    share = float(volumes[0].square().sum() / sum(v.square().sum() for v in volumes))
+    assert share > 0.6
+    assert shared.weight == pytest.approx(40 * (90 / 40) ** (1 - share))
+    assert shared.least == pytest.approx(10 * 2 ** (1 - share))
+    assert shared.contrast == pytest.approx(contrast(torch.cat(volumes)))
+    # one of them has found no weight, and has no say; where none has, there is none
+    none = replace(findings[1], weight=None, least=None)
+    assert SharedPriors.by([findings[0], none]).weight == pytest.approx(40.0)
+    assert SharedPriors.by([none, none]) == SharedPriors(None, None, none.contrast)
+    # of empty tiles all count alike
+    empty = [replace(finding, squares=0.0) for finding in findings]
+    assert SharedPriors.by(empty).weight == pytest.approx(60.0)
+
+
+def test_where_no_weight_is_found_or_gone_on_with_one_tile_leads(field):
+    whole, _ = field
+    assert leaders(whole) == LEADERS > 1
+    assert leaders(replace(whole, weight=None)) == 1
+    assert leaders(replace(whole, method="adam")) == 1
 
 
 def test_the_first_tiles_weight_goes_by_the_pixels_that_count_in_the_field(field):

@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from recon.fit.newton.correction import drafts
-from recon.fit.newton.descent import COARSE_STEPS, expected_misled
+from recon.fit.newton.descent import coarse_steps, expected_misled
 from recon.fit.planned import GivenFidelity
 from recon.fit.problem import Problem
 from torchdic import Acquisition, Fidelity, Microscope, Volume
@@ -44,9 +44,18 @@ class Forecast:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._trial: float | None = None
+        self._misled = False
         self._costs = _costs(problem)
         self._last: deque[tuple[float, float]] = deque(maxlen=LAST)
         self._of_kind: dict[float, deque[float]] = {}
+
+    def of_another(self, problem: Problem) -> "Forecast":
+        """That of another descent, whose steps take for their cost what they have taken in this one."""
+        other = Forecast(problem)
+        other._trial, other._of_kind = self._rate(), self._of_kind
+        if self._misled:
+            other._misled, other._costs = True, _costs(problem, misled=True)
+        return other
 
     @property
     def untried(self) -> bool:
@@ -71,7 +80,7 @@ class Forecast:
         if self.untried and (first := _first(self._problem)) is not None:
             self._trial = _trial(self._problem, first) / (WITH_GRADIENT * work(first, *_scene(self._problem)))
             if _expected_misled(self._problem):
-                self._costs = _costs(self._problem, misled=True)
+                self._misled, self._costs = True, _costs(self._problem, misled=True)
         usual = USUAL_STEPS if self._problem.method == "newton" else len(self._costs)
         rate = self._rate()
         return None if rate is None else rate * sum(self._costs[number : max(usual, number + 1)])
@@ -140,7 +149,7 @@ def _careful(problem: Problem) -> Fidelity | None:
 
 def _expected_misled(problem: Problem) -> bool:
     """Whether Newton's later steps will probably have all directions, for few mislead."""
-    if problem.method != "newton" or problem.steps <= COARSE_STEPS or _careful(problem) is None:
+    if problem.method != "newton" or problem.steps <= coarse_steps(problem) or _careful(problem) is None:
         return False
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the descent's own images will warn
@@ -165,14 +174,15 @@ def _cost(problem: Problem, number: int, misled: bool) -> float:
     coarse, fine = drafts(careful, problem.fidelity.draft_sources)
     if misled:
         _, fine = drafts(careful, None)
-    draft = coarse if number < COARSE_STEPS else fine
+    first = coarse_steps(problem)
+    draft = coarse if number < first else fine
     each = work(draft, *scene)
     cost = WITH_GRADIENT * each + MODEL * each / directions(scene[1], draft.sources)
-    if number in (0, COARSE_STEPS):
+    if number in (0, first):
         cost += HESSIAN * each
-    if number >= COARSE_STEPS and fine != careful:
+    if number >= first and fine != careful:
         exact = work(careful, *scene)
-        cost += exact + MISSED * (exact + each) if number == COARSE_STEPS else RENEWED * exact
+        cost += exact + MISSED * (exact + each) if number == first else RENEWED * exact
     return cost
 
 

@@ -33,16 +33,18 @@ STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError, ImportErr
 LONG = 60.0
 
 
-def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, tiles: int = 1) -> None:
+def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, tiles: int = 1, more: float = 0.0) -> None:
     """Print what a descent will take, after a trial; nothing where its fidelity has yet to be planned.
 
-    number: steps so far. tiles: descents like this one. Raises as the images of a step do.
+    number: steps so far. tiles: descents like this one. more: what comes on top of them, in such descents.
+    Raises as the images of a step do.
     """
     seconds = forecast.whole(number)
     if seconds is None:
         return
-    words = f"foreseen: {spoken(tiles * seconds)}{f' for {tiles} tiles' if tiles > 1 else ''}"
-    if tiles * seconds > LONG:
+    seconds *= tiles + more
+    words = f"foreseen: {spoken(seconds)}{f' for {tiles} tiles' if tiles > 1 else ''}"
+    if seconds > LONG:
         words += f" and {bytes_held(problem, GaussianMisfit) / GIB:.2g} GiB"
     if problem.method == "newton" and problem.steps > USUAL_STEPS:
         words += f", if descents end after {USUAL_STEPS} of {problem.steps} steps, as is usual"

@@ -1,12 +1,7 @@
-"""The problem of one tile, and what all tiles share.
-
-A field that is fitted whole has one scale of its misfit, one weight of its priors, one contrast that they know, and one
-value of what is learned beside Δn. So have its tiles: the one whose images show most is fitted first, as any field is,
-and the others take from it what a specimen's contrast tells, and an empty tile would guess.
-"""
+"""The problem of one tile of a field, with what it shares with the others."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool
@@ -16,49 +11,26 @@ from recon.fit.nuisances.light import Lamp
 from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
-from recon.fit.unknowns import IndexDifference, Unknown, with_support
+from recon.fit.unknowns import with_support
 from recon.misfit.base import Misfit
 from recon.misfit.level import image_means
-from recon.prior.base import contrast
 from recon.prior.weight import FollowsNoise, Inside
 from recon.tiling.layout import Layout, Span, Tile
+from recon.tiling.shared import LearnedByFirst, SharedPriors, is_of_tile
 
-
-@dataclass(frozen=True, eq=False)
-class SharedByTiles:
-    """What the first tile's fit says of all tiles.
-
-    misfit: whose scale is that of all. weight: of the priors, where it follows the noise. least: what it was at least
-    on its way. contrast: of the specimen. values: of what was learned beside Δn, by name, but for the lamp: an uneven
-    one is another one in each tile.
-    """
-
-    misfit: Misfit
-    weight: float | None
-    least: float | None
-    contrast: float
-    values: dict[str, Tensor]
-
-    @classmethod
-    def by(cls, problem: Problem, last: Step) -> "SharedByTiles":
-        """What a tile's finished fit says. problem: its own. last: its last step."""
-        weights = [record["tv"] for record in last.weights] if problem.weight is not None else []
-        own = {u.name for u in problem.unknowns if _is_of_tile(u)}
-        values = {name: value for name, value in last.values.items() if name not in own}
-        found, least = (weights[-1], min(weights)) if weights else (None, None)
-        return cls(problem.misfit, found, least, contrast(last.delta), values)
+# Steps at most in which a tile goes on with another weight. Four or five do; what is left is far below the noise.
+STEPS_AGAIN = 6
 
 
 def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:
-    """The tiles in the order in which they are fitted: the one whose images show most, then row by row."""
+    """The tiles in the order in which they are fitted: by how much their images show."""
     contrast = misfit.where_counted(misfit.data - image_means(misfit.data, misfit.mask)).square()
     power = (contrast / misfit.variance).mean((0, 1))
 
     def shown(tile: Tile) -> float:
         return float(power[tile.rows.pixels, tile.columns.pixels].sum())
 
-    first = max(layout, key=shown)
-    return [first, *(tile for tile in layout if tile != first)]
+    return sorted(layout, key=shown, reverse=True)
 
 
 def without_margin(problem: Problem) -> Problem:
@@ -85,32 +57,53 @@ def lacks(whole: Problem, layout: Layout, tile: Tile) -> str | None:
 
 
 def problem_of_tile(
-    whole: Problem, layout: Layout, tile: Tile, noise: Sequence[float] | None, shared: SharedByTiles | None = None
+    whole: Problem,
+    layout: Layout,
+    tile: Tile,
+    noise: Sequence[float] | None,
+    learned: LearnedByFirst | None = None,
+    priors: SharedPriors | None = None,
 ) -> Problem:
     """What is to be fitted of a tile.
 
     whole: the problem of the field, without a margin. noise: standard deviation of each prism's; None isn't known.
-    shared: by the first tile; None is that one itself.
+    learned: by the first tile; None is that one itself. priors: as the leaders say; None is a leader, which finds its
+    own weight and contrast.
     Raises ValueError where the tile `lacks` what is to be fitted and for an uneven lamp that isn't learned, and
     NotImplementedError for a misfit that has no parts.
     """
     if whole.setup.lamp is not None:
         raise ValueError("an uneven lamp that is given can't be cut into tiles; learn it")
     # given weights of the priors are relative to the scale of the whole
-    unit = whole.misfit if whole.weight is None else None if shared is None else shared.misfit
+    unit = whole.misfit if whole.weight is None else None if learned is None else learned.misfit
     misfit = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
     setup = _setup(whole.setup, layout)
     unknowns = [with_support(u, lambda support: _with_margin(support, tile, layout.margin)) for u in whole.unknowns]
-    if shared is not None:
+    if learned is not None:
         for unknown in unknowns:
-            if not _is_of_tile(unknown):
-                setup = unknown.put(shared.values[unknown.name].to(misfit.data.device), setup)
-        unknowns = [unknown for unknown in unknowns if _is_of_tile(unknown)]
+            if not is_of_tile(unknown):
+                setup = unknown.put(learned.values[unknown.name].to(misfit.data.device), setup)
+        unknowns = [unknown for unknown in unknowns if is_of_tile(unknown)]
     tile_problem = replace(whole, setup=setup, misfit=misfit, unknowns=unknowns)
-    inside = _inside(misfit, layout, tile) if shared is None else None
-    return replace(
-        tile_problem, weight=_weight(whole, tile_problem, inside, noise, shared), contrast=shared and shared.contrast
-    )
+    inside = _inside(misfit, layout, tile) if priors is None else None
+    weight = _weight(whole, tile_problem, inside, noise, priors)
+    return replace(tile_problem, weight=weight, contrast=None if priors is None else priors.contrast)
+
+
+def gone_on_with(problem: Problem, last: Step) -> Problem:
+    """The problem of a tile that goes on from an earlier fit, with the weight that all share from the first step on.
+
+    problem: as others than the leaders have it. last: the earlier fit's last step. It takes STEPS_AGAIN at most.
+    """
+    setup = problem.setup
+    for unknown in problem.unknowns:
+        if isinstance(unknown, Lamp):
+            setup = unknown.put(last.values[unknown.name].to(problem.misfit.data.device), setup)
+    rule = problem.weight
+    assert rule is not None
+    held = replace(rule, first=rule.towards, towards=None, held=True)
+    steps = min(problem.steps, STEPS_AGAIN)
+    return replace(problem.again(problem.misfit, last, last.delta), setup=setup, weight=held, steps=steps)
 
 
 def _inside(misfit: Misfit, layout: Layout, tile: Tile) -> Inside | None:
@@ -125,31 +118,27 @@ def _inside(misfit: Misfit, layout: Layout, tile: Tile) -> Inside | None:
 
 
 def _weight(
-    whole: Problem, tile: Problem, inside: Inside | None, noise: Sequence[float] | None, shared: SharedByTiles | None
+    whole: Problem, tile: Problem, inside: Inside | None, noise: Sequence[float] | None, priors: SharedPriors | None
 ) -> FollowsNoise:
-    """The common factor of a tile's priors: found by the first tile, from what is inside it.
+    """The common factor of a tile's priors: a leader finds it, from what is inside the tile.
 
-    The others go there from the least of its way, as they would in a fit of the whole; where it took too few steps to
-    find one, theirs stays as it begins. Weights that are given are those of the whole field without a margin.
+    The others go there from the least of the leaders' way, as they would in a fit of the whole; where the leaders took
+    too few steps to find one, theirs stays as it begins. Weights that are given are those of the whole field without a
+    margin.
     """
     misfit = tile.misfit if inside is None else inside.misfit
     pixels = int(misfit.pixels.sum())
     if whole.weight is None:
         return FollowsNoise(None, pixels, tile.setup.dilution, held=True)
     known = misfit.of_noise(noise) if misfit.knows_all and noise is not None else None
-    if shared is None:
+    if priors is None:
         return replace(whole.weight, noise_misfit=known, pixels=pixels, inside=inside)
-    return FollowsNoise(known, pixels, shared.least, held=shared.weight is None, towards=shared.weight)
+    return FollowsNoise(known, pixels, priors.least, held=priors.weight is None, towards=priors.weight)
 
 
 def _counting(mask: Bool[Tensor, "prism focus y x"]) -> Bool[Tensor, " prism"]:
     """Whether a pixel of each prism counts."""
     return mask.flatten(1).any(1)
-
-
-def _is_of_tile(unknown: Unknown) -> bool:
-    """Whether each tile has its own value of an unknown."""
-    return isinstance(unknown, IndexDifference | Lamp)
 
 
 def _setup(whole: Setup, layout: Layout) -> Setup:

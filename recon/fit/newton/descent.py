@@ -93,6 +93,15 @@ def minimise_by_newton(problem: Problem, resume: Step | None = None) -> Iterator
     yield from _Descent(problem).steps(resume)
 
 
+def coarse_steps(problem: Problem) -> int:
+    """The steps of a problem's descent with the fewest directions.
+
+    There are none where a volume is given: it is already as the many directions see it.
+    """
+    given = any(isinstance(u, IndexDifference) and u.given is not None for u in problem.unknowns)
+    return 0 if given else COARSE_STEPS
+
+
 def expected_misled(problem: Problem) -> bool:
     """Whether few directions will probably mislead a problem's descent, by a linear estimate. Its fidelity is given.
 
@@ -114,8 +123,7 @@ class _Descent:
             raise ValueError(f"Newton's method finds Δn and nuisances, not {', '.join(others)}; use method 'adam'")
         check_linear_response(problem.setup.microscope, problem.setup.acquisition)
         self.bounds = self.index.bounds
-        # a given volume is already as the many directions see it
-        self.coarse = COARSE_STEPS if self.index.given is None else 0
+        self.coarse = coarse_steps(problem)
         grid = problem.setup.volume.grid
         self.ratio = grid.spacing[2] / grid.spacing[0]
         self.voxels = math.prod(grid.shape)
@@ -305,7 +313,7 @@ class _Descent:
         parameters = {u.name: u.start(problem.setup, problem.misfit).detach() for u in self.nuisances}
         place = Place(delta, parameters, parameters, Split.at(delta), Correction(), weight=1.0, scale=1.0)
         place, hessian, now = self.turned(place, draft, exact)
-        if given is not None and (scale := contrast(delta)) > 0:
+        if given is not None and (scale := problem.contrast or contrast(delta)) > 0:
             place = replace(place, scale=scale, weight=self.first_weight(scale), known=True, width=1.0)
             return place, hessian, now
         linear = self.linear(place, hessian, now, TIKHONOV)

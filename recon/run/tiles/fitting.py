@@ -15,19 +15,25 @@ from recon.config.schema import ConfigError
 from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference
+from recon.prior.weight import record
 from recon.report.forecast import Forecast
 from recon.run.checkpoint import Checkpoint
 from recon.run.folder.prepared import keep_folder
 from recon.run.interruption import InterruptedRunError
 from recon.run.recorded import STOPPING, descend_recorded, tell_foreseen
 from recon.run.results import GO_ON, ResultsError, Tiled, leave_interrupted, model_images
-from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, keep, kept, prepared, remember_side
+from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, is_kept, keep, kept, prepared, remember_side
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
-from recon.tiling.part import SharedByTiles, lacks, problem_of_tile, strongest_first
+from recon.tiling.part import gone_on_with, lacks, problem_of_tile, strongest_first
+from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors, leaders
+from recon.tiling.visits import Visit
 from torchdic.files.whole import WriteError
 from torchdic.ranks.group import rank, ranks
 from torchdic.ranks.shared import everywhere
+
+# What the second fit of a leader takes, over that of its first: some five steps, with all that a descent begins with.
+AGAIN = 0.3
 
 
 def tiles_to_fit(whole: Problem, layout: Layout) -> tuple[Tile, ...]:
@@ -66,86 +72,123 @@ class TiledFit:
     identity: str
     checkpoint_every: int
 
+    @property
+    def leading(self) -> list[Visit]:
+        """The leaders' own fits, the first tile's first."""
+        return [Visit(tile) for tile in self.tiles[: leaders(self.whole)]]
+
+    @property
+    def following(self) -> list[Visit]:
+        """The fits that go by what the leaders have found: their own again, and those of the other tiles.
+
+        A lone leader has nothing to take over from others.
+        """
+        leading = self.leading
+        again = leading if len(leading) > 1 and self.priors.weight is not None else []
+        return [*(Visit(visit.tile, again=True) for visit in again), *map(Visit, self.tiles[len(leading) :])]
+
     def fitted(self) -> Tiled:
-        """Fit the tiles that have yet to be fitted, and put all of them together.
+        """Make the fits that have yet to be made, and put all tiles together.
 
         Raises as `descend_recorded` does, with the tile's checkpoint and the volume of the fitted tiles left in the
         folder, and ResultsError where a fitted tile can't be kept.
         """
-        first, *others = self.tiles
+        first, *leading = self.leading
         forecast = Forecast(self.problem(first))
         if self.kept(first) is None:
-            tell_foreseen(self.problem(first), forecast, tiles=math.ceil(len(self.tiles) / ranks()))
+            again = AGAIN * len(leading) / ranks()
+            tell_foreseen(self.problem(first), forecast, tiles=math.ceil(len(self.tiles) / ranks()), more=again)
             self.fit(first, forecast)
-        missing = [tile for tile in others if self.kept(tile) is None]
-        if missing:
-            if forecast.untried:
-                tell_foreseen(self.problem(missing[0]), forecast, tiles=math.ceil(len(missing) / ranks()))
-            everywhere(_fit_share, self, missing, forecast)
+        self._fit_missing(leading, forecast)
+        self._fit_missing(self.following, forecast)
         return self.together()
 
-    def fit(self, tile: Tile, forecast: Forecast) -> None:
+    def _fit_missing(self, visits: Sequence[Visit], forecast: Forecast) -> None:
+        """Make those of some fits that have yet to be made, shared out among the processes."""
+        missing = [visit for visit in visits if self.kept(visit) is None]
+        if not missing:
+            return
+        if forecast.untried:
+            tell_foreseen(self.problem(missing[0]), forecast, tiles=math.ceil(len(missing) / ranks()))
+        everywhere(_fit_share, self, missing, forecast)
+
+    def fit(self, visit: Visit, forecast: Forecast) -> None:
         """Fit one tile and keep it. forecast: of the time left. Raises as `fitted` does."""
-        print(f"tile {tile}, {self.tiles.index(tile) + 1} of {len(self.tiles)}")
-        folder, identity, problem = folder_of(self.out, tile), self.identity_of(tile), self.problem(tile)
+        print(f"tile {visit}, {self.tiles.index(visit.tile) + 1} of {len(self.tiles)}")
+        folder, identity, problem = folder_of(self.out, visit), self.identity_of(visit), self.problem(visit)
         with _told():
             self._prepare(folder)
         start = begun(folder, identity)
 
         def leave(step: Step) -> str:
             # of several processes, the first leaves it for all
-            return self.leave_so_far(tile, step) if rank() == 0 else "its Δn so far is in the checkpoint"
+            return self.leave_so_far(visit, step) if rank() == 0 else "its Δn so far is in the checkpoint"
 
         try:
             ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave, forecast)
         except InterruptedRunError as error:
-            raise InterruptedRunError(f"tile {tile}: {error}") from None
+            raise InterruptedRunError(f"tile {visit}: {error}") from None
         except STOPPING as error:
-            error.args = (f"tile {tile}: {error}",)
+            error.args = (f"tile {visit}: {error}",)
             raise
         with _told():
             self._prepare(folder)  # it may have been removed, with what it was in
             keep(folder, ended)
 
     def _prepare(self, folder: Path) -> None:
-        """Make a tile's folder, and leave beside it what the tiles are. Raises WriteError and FolderInUseError."""
+        """Make a fit's folder, and leave beside it what the tiles are. Raises WriteError and FolderInUseError."""
         keep_folder(self.out)
         prepared(folder)
         remember_side(self.out, self.layout.side, self.whole.fidelity.coarse.memory)
 
-    def kept(self, tile: Tile) -> Checkpoint | None:
+    def kept(self, visit: Visit) -> Checkpoint | None:
         """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
-        return kept(folder_of(self.out, tile), self.identity_of(tile))
+        return kept(folder_of(self.out, visit), self.identity_of(visit))
 
-    def found(self, tile: Tile) -> Checkpoint:
+    def found(self, visit: Visit) -> Checkpoint:
         """A tile that has been fitted. Raises as `kept` does, and ResultsError where it is gone."""
-        ended = self.kept(tile)
+        ended = self.kept(visit)
         if ended is None:
-            gone = folder_of(self.out, tile) / FITTED
+            gone = folder_of(self.out, visit) / FITTED
             raise ResultsError(f"{gone}: was removed during the run; go on with --resume, which fits that tile again")
         return ended
 
-    def identity_of(self, tile: Tile) -> str:
+    def identity_of(self, visit: Visit) -> str:
         """What a tile's fit depends on."""
-        return identity_of(self.identity, self.layout, tile, self.whole.steps, self._taken_over_by(tile))
+        return identity_of(self.identity, self.layout, visit.tile, self.whole.steps, self._taken_over_by(visit))
 
-    def _taken_over_by(self, tile: Tile) -> str:
-        """What a tile takes over from the first one, in words; none of the first itself."""
-        if tile == self.tiles[0]:
+    def _taken_over_by(self, visit: Visit) -> str:
+        """What a tile's fit takes over from others, in words."""
+        if visit == self.leading[0]:
             return ""
-        shared = self.shared
-        return f"weight {shared.least} to {shared.weight}, contrast {shared.contrast}"
+        if visit in self.leading:
+            first = self.learned.finding
+            return f"scale of weight {first.weight}, contrast {first.contrast}"
+        priors = self.priors
+        way = "at once" if visit.again else f"from {priors.least} on"
+        return f"weight {priors.weight} {way}, contrast {priors.contrast}"
 
     @cached_property
-    def shared(self) -> SharedByTiles:
+    def learned(self) -> LearnedByFirst:
         """What the first tile, which is fitted, says of all."""
-        first = self.tiles[0]
-        return SharedByTiles.by(self.problem(first), self.found(first).step)
+        first = self.leading[0]
+        return LearnedByFirst.by(self.problem(first), self.found(first).step)
 
-    def problem(self, tile: Tile) -> Problem:
-        """What is to be fitted of a tile."""
-        shared = None if tile == self.tiles[0] else self.shared
-        return problem_of_tile(self.whole, self.layout, tile, self.noise, shared)
+    @cached_property
+    def priors(self) -> SharedPriors:
+        """What the leaders, which are fitted, say together."""
+        return SharedPriors.by([Finding.by(self.found(visit).step) for visit in self.leading])
+
+    def problem(self, visit: Visit) -> Problem:
+        """What a fit is to find."""
+
+        def of_tile(learned: LearnedByFirst | None = None, priors: SharedPriors | None = None) -> Problem:
+            return problem_of_tile(self.whole, self.layout, visit.tile, self.noise, learned, priors)
+
+        if visit in self.leading:
+            return of_tile(None if visit == self.leading[0] else self.learned)
+        problem = of_tile(self.learned, self.priors)
+        return gone_on_with(problem, self.found(Visit(visit.tile)).step) if visit.again else problem
 
     def volume(
         self,
@@ -158,45 +201,52 @@ class TiledFit:
 
     def images(self) -> Float[Tensor, "prism focus y x"]:
         """The model's images of the field."""
-        found = ((tile, model_images(self.problem(tile), ended.step)) for tile, ended in self.all_found())
+        found = ((visit.tile, model_images(self.problem(visit), self.found(visit).step)) for visit in self.last)
         return blended_images(self.layout, self.whole.setup.shape[:2], found)
 
-    def all_found(self) -> Iterator[tuple[Tile, Checkpoint]]:
-        """All tiles, one at a time. Raises as `found` does."""
-        return ((tile, self.found(tile)) for tile in self.tiles)
+    @property
+    def last(self) -> list[Visit]:
+        """The last fit of each tile, in the tiles' order."""
+        return list({visit.tile.number: visit for visit in [*self.leading, *self.following]}.values())
 
-    def ended(self) -> Iterator[tuple[Tile, Checkpoint]]:
-        """The fitted tiles, one at a time."""
-        for tile in self.tiles:
-            found = self.kept(tile)
-            if found is not None:
-                yield tile, found
-            elif tile == self.tiles[0]:
-                return  # the others are fitted after it
+    def so_far(self) -> Iterator[tuple[Tile, Checkpoint]]:
+        """The tiles that have been fitted, each as its last fit so far has it; one at a time."""
+        there = [is_kept(folder_of(self.out, visit)) for visit in self.leading]
+        if not there[0]:
+            return  # all others are fitted after it
+        visits = [*self.leading, *(self.following if all(there) else [])]
+        fits = {visit.tile.number: visit for visit in visits if is_kept(folder_of(self.out, visit))}
+        yield from ((visit.tile, self.found(visit)) for visit in fits.values())
 
     def together(self) -> Tiled:
         """What the fitted tiles say together."""
-        steps, seconds = {}, {}
-        for tile, ended in self.all_found():
-            steps[str(tile)], seconds[str(tile)] = ended.step.number, ended.step.seconds
-        first, delta = self.found(self.tiles[0]), self.volume(self.all_found())
-        values = {**self.shared.values, IndexDifference.name: delta}
-        whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()))
-        ended = replace(first, step=whole)
+        steps, seconds = {str(tile): 0 for tile in self.tiles}, {str(tile): 0.0 for tile in self.tiles}
+        for visit in [*self.leading, *self.following]:
+            ended = self.found(visit).step
+            steps[str(visit.tile)] += ended.number
+            seconds[str(visit.tile)] += ended.seconds
+        first, delta = self.found(self.leading[0]), self.volume((v.tile, self.found(v)) for v in self.last)
+        values = {**self.learned.values, IndexDifference.name: delta}
+        weights = first.step.weights
+        if self.priors.weight is not None:
+            weights = (*weights, record(first.step.number, self.priors.weight, "the leading tiles' mean"))
+        whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()), weights=weights)
         axes = self.layout.along_y, self.layout.along_x
-        record = {
+        found = {
             "pixels": [axis.size for axis in axes],
             "overlap": [axis.overlap for axis in axes],
             "margin": self.layout.margin,
             "steps": steps,
             "seconds": {name: round(value, 3) for name, value in seconds.items()},
         }
-        return Tiled(ended, self.images(), self.problem(self.tiles[0]), record)
+        return Tiled(replace(first, step=whole), self.images(), self.problem(self.leading[0]), found)
 
-    def leave_so_far(self, tile: Tile, step: Step) -> str:
+    def leave_so_far(self, stopped: Visit, step: Step) -> str:
         """Leave the volume of the fitted tiles and of one that is stopped at a step; returns words about it."""
-        number = f"{sum(1 for _ in self.ended())} of {len(self.tiles)} tiles"
-        delta = self.volume(self.ended(), [(tile, step.delta.detach().cpu())])
+        others = [tile for tile, _ in self.so_far() if tile != stopped.tile]
+        number = f"{len(others)} of {len(self.tiles)} tiles"
+        fitted = ((tile, ended) for tile, ended in self.so_far() if tile != stopped.tile)
+        delta = self.volume(fitted, [(stopped.tile, step.delta.detach().cpu())])
         path = leave_interrupted(self.out, delta, self.whole.setup.field, f"delta n, interrupted after {number}")
         return f"{path.name} holds Δn so far: {number}, and this one as it is"
 
@@ -210,7 +260,7 @@ def _told() -> Iterator[None]:
         raise ResultsError(f"{error}{GO_ON}") from error
 
 
-def _fit_share(fit: TiledFit, tiles: Sequence[Tile], forecast: Forecast) -> None:
-    """Fit a process' share of some tiles. forecast: of the time left of one."""
-    for tile in tiles[rank() :: ranks()]:
-        fit.fit(tile, forecast)
+def _fit_share(fit: TiledFit, visits: Sequence[Visit], forecast: Forecast) -> None:
+    """Make a process' share of some fits. forecast: of the time left of one."""
+    for visit in visits[rank() :: ranks()]:
+        fit.fit(visit, forecast.of_another(fit.problem(visit)) if visit.again else forecast)

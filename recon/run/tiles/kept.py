@@ -9,6 +9,7 @@ from pathlib import Path
 from recon.run.checkpoint import Checkpoint, CheckpointError, load, save
 from recon.run.recorded import CHECKPOINT
 from recon.tiling.layout import Layout, Tile
+from recon.tiling.visits import Visit
 from torchdic.files.whole import PARTIAL, WriteError, remove_partial, write_json
 
 TILES = "tiles"
@@ -20,9 +21,9 @@ FITTED = "fitted.pt"
 LAYOUT = "layout.json"
 
 
-def folder_of(out: Path, tile: Tile) -> Path:
-    """The folder of a tile's log and checkpoint."""
-    return out / TILES / str(tile)
+def folder_of(out: Path, visit: Visit) -> Path:
+    """The folder of the log and the checkpoint of a tile's fit."""
+    return out / TILES / str(visit).replace(" ", "-")
 
 
 def prepared(folder: Path) -> None:
@@ -35,12 +36,12 @@ def prepared(folder: Path) -> None:
 
 
 def identity_of(whole: str, layout: Layout, tile: Tile, steps: int, shared: str = "") -> str:
-    """What a tile's fit depends on. whole: of the field. shared: of what the first tile said."""
+    """What a tile's fit depends on. whole: of the field. shared: of what other tiles' fits said."""
     rows, columns = tile.rows.pixels, tile.columns.pixels
     lines = [
         f"tile = rows {rows.start} to {rows.stop}, columns {columns.start} to {columns.stop}, margin {layout.margin}",
         f"reconstruction.steps = {steps}",  # a fitted tile can't go on
-        f"the first tile's fit = {shared or 'this one'}",
+        f"taken over from other tiles = {shared or 'nothing'}",
     ]
     return "\n".join([whole, *lines])
 
@@ -51,9 +52,14 @@ def keep(folder: Path, ended: Checkpoint) -> None:
     (folder / CHECKPOINT).unlink(missing_ok=True)
 
 
+def is_kept(folder: Path) -> bool:
+    """Whether a folder holds a fitted tile."""
+    return (folder / FITTED).exists()
+
+
 def kept(folder: Path, identity: str) -> Checkpoint | None:
     """A fitted tile; None where it has yet to be fitted. Raises CheckpointError where it is another run's."""
-    return load(folder / FITTED, identity) if (folder / FITTED).exists() else None
+    return load(folder / FITTED, identity) if is_kept(folder) else None
 
 
 def begun(folder: Path, identity: str) -> Checkpoint | None:

@@ -1,0 +1,110 @@
+"""What all tiles of a field share, as they would in a fit of the whole: one scale of the misfit, one weight of the
+priors, one contrast that they know, and one value of what is learned beside Δn.
+
+The tiles whose images show most are the leaders. The first of them is fitted as any field is, and gives all tiles the
+scale and what is learned. Each leader finds a weight by its own noise, and that is known to it only roughly: four of
+them find one within some 40 % of that of the whole field on either side, and their mean within 20 %.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon.fit.nuisances.light import Lamp
+from recon.fit.problem import Problem
+from recon.fit.step import Step
+from recon.fit.unknowns import IndexDifference, Unknown
+from recon.misfit.base import Misfit
+from recon.prior.base import contrast
+
+# Leaders. More of them agree more closely, and each costs its tile half as many steps again.
+LEADERS = 4
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one leader's fit says of the specimen.
+
+    weight: of the priors in the end, and least: on its way; None where it took too few steps to find one, or has no
+    say. contrast: of the specimen. squares: the sum of Δn².
+    """
+
+    weight: float | None
+    least: float | None
+    contrast: float
+    squares: float
+
+    @classmethod
+    def by(cls, last: Step) -> "Finding":
+        """What a leader's last step says."""
+        weights = [record["tv"] for record in last.weights]
+        squares = float(last.delta.square().sum(dtype=torch.float64))
+        found, least = (weights[-1], min(weights)) if weights else (None, None)
+        return cls(found, least, contrast(last.delta), squares)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedByFirst:
+    """What the first tile's fit says of all tiles.
+
+    misfit: whose scale is that of all. values: of what was learned beside Δn, by name, but for the lamp: an uneven one
+    is another one in each tile. finding: of the specimen in it.
+    """
+
+    misfit: Misfit
+    values: dict[str, Tensor]
+    finding: Finding
+
+    @classmethod
+    def by(cls, problem: Problem, last: Step) -> "LearnedByFirst":
+        """What a finished fit says. problem: the first tile's. last: its last step."""
+        own = {unknown.name for unknown in problem.unknowns if is_of_tile(unknown)}
+        values = {name: value for name, value in last.values.items() if name not in own}
+        return cls(problem.misfit, values, Finding.by(last))
+
+
+def is_of_tile(unknown: Unknown) -> bool:
+    """Whether each tile has its own value of an unknown."""
+    return isinstance(unknown, IndexDifference | Lamp)
+
+
+@dataclass(frozen=True)
+class SharedPriors:
+    """What the priors of all tiles go by.
+
+    weight: to which all go, from `least` on; None where no leader has found one. contrast: of the specimen.
+    """
+
+    weight: float | None
+    least: float | None
+    contrast: float
+
+    @classmethod
+    def by(cls, findings: Sequence[Finding]) -> "SharedPriors":
+        """What leaders say together, each by its share of the specimen: the misfit hangs on the weight there alone."""
+        typical = _mean([finding.contrast for finding in findings], findings)
+        told = [(f, f.weight, f.least) for f in findings if f.weight is not None and f.least is not None]
+        if not told:
+            return cls(None, None, typical)
+        having, weights, leasts = zip(*told, strict=True)
+        weight, least = (math.exp(_mean([math.log(v) for v in values], having)) for values in (weights, leasts))
+        return cls(weight, least, typical)
+
+
+def leaders(whole: Problem) -> int:
+    """How many tiles lead: one where there is no weight to be found, or the descent can't go on from a volume.
+
+    Adam's rate has fallen to nothing by the end of its steps.
+    """
+    return LEADERS if whole.weight is not None and whole.method == "newton" else 1
+
+
+def _mean(values: Sequence[float], findings: Sequence[Finding]) -> float:
+    """The mean of a value of each finding; of empty volumes, all count alike."""
+    shares = [finding.squares for finding in findings]
+    if sum(shares) == 0:
+        shares = [1.0] * len(findings)
+    return sum(share * value for share, value in zip(shares, values, strict=True)) / sum(shares)
