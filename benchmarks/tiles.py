@@ -14,7 +14,9 @@ import math
 import time
 import warnings
 from collections import deque
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from io import StringIO
 from itertools import product
 from pathlib import Path
 
@@ -138,7 +140,8 @@ def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...], 
     began, folder = time.process_time(), out / "kept"
     fit = TiledFit(problem, layout, tuple(strongest_first(layout, problem.misfit)), noise, folder, "", problem.steps)
     prepare_folder(folder)
-    tiled = fit.fitted()
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # bars and lines of each tile
+        tiled = fit.fitted()
     first, last = tiled.first, tiled.ended.step
     forget(folder)
     seconds = time.process_time() - began

@@ -32,8 +32,17 @@ from recon.run.tiles.fitting import TiledFit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
-from recon.tiling.part import gone_on_with, lacks, problem_of_tile, strongest_first, without_margin
-from recon.tiling.shared import LEADERS, Finding, LearnedByFirst, SharedPriors, leaders
+from recon.tiling.part import (
+    LEADERS,
+    finding_of,
+    gone_on_with,
+    lacks,
+    leaders,
+    problem_of_tile,
+    strongest_first,
+    without_margin,
+)
+from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors
 from torchdic import (
     Acquisition,
     Camera,
@@ -238,7 +247,7 @@ def learned_of(whole):
     return LearnedByFirst(whole.misfit, {"brightness": torch.full((2, 3), 1.02)}, Finding(70.0, 40.0, 0.012, 1.0))
 
 
-def test_a_leader_finds_its_own_weight_and_takes_over_the_first_tiles_scale(field):
+def test_a_leader_finds_its_own_weight_in_its_own_scale(field):
     whole, _ = field
     layout = layout_of(FIELD, 40, 5, 10)
     first, second = strongest_first(layout, whole.misfit)
@@ -250,7 +259,7 @@ def test_a_leader_finds_its_own_weight_and_takes_over_the_first_tiles_scale(fiel
     leader = problem_of_tile(whole, layout, second, [NOISE] * 2, learned)
     assert [unknown.name for unknown in leader.unknowns] == ["delta"]
     assert torch.equal(leader.setup.brightness, learned.values["brightness"])
-    assert torch.equal(leader.misfit.variance, whole.misfit.variance)
+    assert float(leader.misfit.variance.mean()) == pytest.approx(float(leader.misfit.data.var((2, 3)).mean()), rel=0.01)
     for problem in (own, leader):
         assert problem.contrast is None
         assert problem.weight.inside is not None
@@ -266,6 +275,8 @@ def test_other_tiles_take_over_what_the_leaders_have_found(field):
     assert [unknown.name for unknown in problem.unknowns] == ["delta"]
     assert (problem.weight.first, problem.weight.towards, problem.contrast) == (40.0, 70.0, 0.012)
     assert not problem.weight.held
+    assert torch.equal(problem.setup.brightness, learned.values["brightness"])
+    assert torch.equal(problem.misfit.variance, whole.misfit.variance)
     none_found = SharedPriors(None, None, 0.012)
     assert problem_of_tile(whole, layout, second, [NOISE] * 2, learned, none_found).weight.held
 
@@ -311,11 +322,33 @@ def test_leaders_count_by_their_share_of_the_specimen():
     assert SharedPriors.by(empty).weight == pytest.approx(60.0)
 
 
-def test_where_no_weight_is_found_or_gone_on_with_one_tile_leads(field):
+@pytest.mark.parametrize("kind", range(4))
+def test_a_leaders_weight_means_the_same_in_the_first_tiles_scale(field, kind):
+    """Misfit and priors keep their ratio, whatever the kind of the misfit: both are scaled alike."""
+    whole, truth = field
+    whole = replace(whole, misfit=kinds(whole.misfit.data, None)[kind])
+    tile = list(layout_of(FIELD, 40, 5, 10))[1]
+    own, unit = (whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit) for unit in (None, whole.misfit))
+    last = Step(9, 0.0, 0.0, truth, 0.0, {}, {}, (), (record(9, 30.0, ""),))
+    found = finding_of(whole, tile, own, last, whole.misfit)
+    images = own.data + 0.01 * torch.rand(own.data.shape, generator=generator(9))
+    assert found.weight / 30 == pytest.approx(float(unit(images)) / float(own(images)), rel=1e-4)
+    assert found.weight != pytest.approx(30.0, rel=0.005)
+
+
+def test_tiles_lead_that_can_find_a_weight(field):
     whole, _ = field
-    assert leaders(whole) == LEADERS > 1
-    assert leaders(replace(whole, weight=None)) == 1
-    assert leaders(replace(whole, method="adam")) == 1
+    grid = replace(FIELD, shape=(5, 24, 130))
+    layout = layout_of(grid, 30, 5, 10)
+    data = torch.nn.functional.pad(whole.misfit.data, (0, 66), value=1.0)
+    setup = replace(whole.setup, volume=empty_medium(grid, 1.33, data))
+    wide = replace(whole, misfit=GaussianMisfit(data), setup=setup)
+    tiles = strongest_first(layout, wide.misfit)
+    shown = [tile for tile in tiles if tile.columns.pixels.start < 64]
+    assert 1 < len(shown) < len(tiles)
+    assert leaders(wide, tiles) == shown[:LEADERS]
+    assert leaders(replace(wide, weight=None), tiles) == tiles[:1]
+    assert leaders(replace(wide, method="adam"), tiles) == tiles[:1]
 
 
 def test_the_first_tiles_weight_goes_by_the_pixels_that_count_in_the_field(field):

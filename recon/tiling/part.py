@@ -12,11 +12,14 @@ from recon.fit.problem import Problem
 from recon.fit.setup import Setup, empty_medium
 from recon.fit.step import Step
 from recon.fit.unknowns import with_support
-from recon.misfit.base import Misfit
+from recon.misfit.base import Misfit, UniformImagesError
 from recon.misfit.level import image_means
 from recon.prior.weight import FollowsNoise, Inside
 from recon.tiling.layout import Layout, Span, Tile
-from recon.tiling.shared import LearnedByFirst, SharedPriors, is_of_tile
+from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors, is_of_tile, scale_over
+
+# Leaders at most. More of them agree more closely, and each costs its tile half as many steps again.
+LEADERS = 4
 
 # Steps at most in which a tile goes on with another weight. Four or five do; what is left is far below the noise.
 STEPS_AGAIN = 6
@@ -31,6 +34,17 @@ def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:
         return float(power[tile.rows.pixels, tile.columns.pixels].sum())
 
     return sorted(layout, key=shown, reverse=True)
+
+
+def leaders(whole: Problem, tiles: Sequence[Tile]) -> list[Tile]:
+    """The first of some tiles, which find what all share; they are given as `strongest_first` has them.
+
+    One leads where there is no weight to be found, or where the descent can't go on from a volume: Adam's rate has
+    fallen to nothing by the end of its steps. Tiles whose images are uniform find nothing. whole: as in `lacks`.
+    """
+    if whole.weight is None or whole.method != "newton":
+        return list(tiles[:1])
+    return [tiles[0], *(tile for tile in tiles[1:LEADERS] if not _is_uniform(whole.misfit, tile))]
 
 
 def without_margin(problem: Problem) -> Problem:
@@ -74,8 +88,8 @@ def problem_of_tile(
     """
     if whole.setup.lamp is not None:
         raise ValueError("an uneven lamp that is given can't be cut into tiles; learn it")
-    # given weights of the priors are relative to the scale of the whole
-    unit = whole.misfit if whole.weight is None else None if learned is None else learned.misfit
+    # given weights of the priors are relative to the scale of the whole, and those that leaders find to their own
+    unit = whole.misfit if whole.weight is None else None if learned is None or priors is None else learned.misfit
     misfit = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
     setup = _setup(whole.setup, layout)
     unknowns = [with_support(u, lambda support: _with_margin(support, tile, layout.margin)) for u in whole.unknowns]
@@ -134,6 +148,21 @@ def _weight(
     if priors is None:
         return replace(whole.weight, noise_misfit=known, pixels=pixels, inside=inside)
     return FollowsNoise(known, pixels, priors.least, held=priors.weight is None, towards=priors.weight)
+
+
+def _is_uniform(misfit: Misfit, tile: Tile) -> bool:
+    """Whether the images of a prism are uniform in a tile."""
+    try:
+        misfit.part(tile.rows.pixels, tile.columns.pixels)
+    except UniformImagesError:
+        return True
+    return False
+
+
+def finding_of(whole: Problem, tile: Tile, misfit: Misfit, last: Step, unit: Misfit) -> Finding:
+    """What a leader's fit says. misfit: its own. last: its last step. unit: the first tile's misfit."""
+    shared = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
+    return Finding.by(last, scale_over(shared, misfit))
 
 
 def _counting(mask: Bool[Tensor, "prism focus y x"]) -> Bool[Tensor, " prism"]:

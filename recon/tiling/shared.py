@@ -1,9 +1,9 @@
 """What all tiles of a field share, as they would in a fit of the whole: one scale of the misfit, one weight of the
 priors, one contrast that they know, and one value of what is learned beside Δn.
 
-The tiles whose images show most are the leaders. The first of them is fitted as any field is, and gives all tiles the
-scale and what is learned. Each leader finds a weight by its own noise, and that is known to it only roughly: four of
-them find one within some 40 % of that of the whole field on either side, and their mean within 20 %.
+The tiles whose images show most are the leaders. Each is fitted as any field is, but that the first one gives the
+others its scale and what it has learned. Each finds a weight by its own noise, and that is known to it only roughly:
+four of them find one within some 40 % of that of the whole field on either side, and their mean within 20 %.
 """
 
 import math
@@ -18,18 +18,16 @@ from recon.fit.problem import Problem
 from recon.fit.step import Step
 from recon.fit.unknowns import IndexDifference, Unknown
 from recon.misfit.base import Misfit
+from recon.misfit.level import image_means
 from recon.prior.base import contrast
-
-# Leaders. More of them agree more closely, and each costs its tile half as many steps again.
-LEADERS = 4
 
 
 @dataclass(frozen=True)
 class Finding:
     """What one leader's fit says of the specimen.
 
-    weight: of the priors in the end, and least: on its way; None where it took too few steps to find one, or has no
-    say. contrast: of the specimen. squares: the sum of Δn².
+    weight: of the priors in the end, and least: on its way, in the first tile's scale; None where it took too few steps
+    to find one. contrast: of the specimen. squares: the sum of Δn².
     """
 
     weight: float | None
@@ -38,9 +36,9 @@ class Finding:
     squares: float
 
     @classmethod
-    def by(cls, last: Step) -> "Finding":
-        """What a leader's last step says."""
-        weights = [record["tv"] for record in last.weights]
+    def by(cls, last: Step, scale: float = 1.0) -> "Finding":
+        """What a leader's last step says. scale: the first tile's over its own, see `scale_over`."""
+        weights = [scale * record["tv"] for record in last.weights]
         squares = float(last.delta.square().sum(dtype=torch.float64))
         found, least = (weights[-1], min(weights)) if weights else (None, None)
         return cls(found, least, contrast(last.delta), squares)
@@ -94,12 +92,13 @@ class SharedPriors:
         return cls(weight, least, typical)
 
 
-def leaders(whole: Problem) -> int:
-    """How many tiles lead: one where there is no weight to be found, or the descent can't go on from a volume.
+def scale_over(misfit: Misfit, other: Misfit) -> float:
+    """What weights count for beside one misfit, over what they count for beside another one of the same images.
 
-    Adam's rate has fallen to nothing by the end of its steps.
+    Both are taken of images that show nothing: prisms that differ in what they show differ in their scales, too.
     """
-    return LEADERS if whole.weight is not None and whole.method == "newton" else 1
+    nothing = image_means(misfit.data, misfit.mask).expand_as(misfit.data)
+    return float(misfit(nothing)) / float(other(nothing))
 
 
 def _mean(values: Sequence[float], findings: Sequence[Finding]) -> float:

@@ -25,8 +25,8 @@ from recon.run.results import GO_ON, ResultsError, Tiled, leave_interrupted, mod
 from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, is_kept, keep, kept, prepared, remember_side
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
-from recon.tiling.part import gone_on_with, lacks, problem_of_tile, strongest_first
-from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors, leaders
+from recon.tiling.part import finding_of, gone_on_with, lacks, leaders, problem_of_tile, strongest_first
+from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors
 from recon.tiling.visits import Visit
 from torchdic.files.whole import WriteError
 from torchdic.ranks.group import rank, ranks
@@ -72,10 +72,10 @@ class TiledFit:
     identity: str
     checkpoint_every: int
 
-    @property
+    @cached_property
     def leading(self) -> list[Visit]:
         """The leaders' own fits, the first tile's first."""
-        return [Visit(tile) for tile in self.tiles[: leaders(self.whole)]]
+        return [Visit(tile) for tile in leaders(self.whole, self.tiles)]
 
     @property
     def following(self) -> list[Visit]:
@@ -177,7 +177,12 @@ class TiledFit:
     @cached_property
     def priors(self) -> SharedPriors:
         """What the leaders, which are fitted, say together."""
-        return SharedPriors.by([Finding.by(self.found(visit).step) for visit in self.leading])
+        return SharedPriors.by([self._finding(visit) for visit in self.leading])
+
+    def _finding(self, visit: Visit) -> Finding:
+        """What a leader, which is fitted, says."""
+        own, last = self.problem(visit).misfit, self.found(visit).step
+        return finding_of(self.whole, visit.tile, own, last, self.learned.misfit)
 
     def problem(self, visit: Visit) -> Problem:
         """What a fit is to find."""
