@@ -529,20 +529,30 @@ def test_a_run_by_tiles_leaves_what_any_run_leaves(workplace):
     }  # fmt: skip
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics["tiles"]["steps"]) == {"1-1", "1-2"}
+    assert min(metrics["tiles"]["steps"].values()) > 4  # both have led, and gone on
+    assert metrics["weights"][-1]["reason"] == "the leading tiles' mean"
+    assert metrics["tv"] == metrics["weights"][-1]["tv"]
     assert metrics["misfit"] < 0.5
     assert volume(out).shape == (3, 22, 40)
     assert load(out / "config.resolved.toml").reconstruction.tiles == 25
 
 
-@pytest.mark.parametrize("at", [("first", 3), pytest.param(("second", 2), marks=pytest.mark.slow)])
-def test_an_interrupted_run_by_tiles_goes_on_where_it_was(workplace, tmp_path, monkeypatch, at):
+@pytest.mark.parametrize(
+    ("fit", "number", "tile", "there"),
+    [
+        (0, 3, "1-1", 0),
+        pytest.param(1, 2, "1-2", 1, marks=pytest.mark.slow),
+        (2, 2, "1-1 again", 1),
+        pytest.param(3, 2, "1-2 again", 1, marks=pytest.mark.slow),
+    ],
+)
+def test_an_interrupted_run_by_tiles_goes_on_where_it_was(workplace, tmp_path, monkeypatch, fit, number, tile, there):
     out, path = tmp_path / "out", workplace / "a.toml"
-    which, number = at
-    interrupt_in_tile(monkeypatch, 0 if which == "first" else 1, number)
+    interrupt_in_tile(monkeypatch, fit, number)
     code, err = command("reconstruct", path, "--out", out)
     assert code == 130, err
-    assert f"interrupted after step {number - 1} of 4; go on with --resume; volume.ome.tif holds Δn so far: " in err
-    assert f"{0 if which == 'first' else 1} of 2 tiles, and this one as it is" in err
+    left = f"go on with --resume; volume.ome.tif holds Δn so far: {there} of 2 tiles, and this one as it is"
+    assert f"tile {tile}: interrupted after step {number - 1} of 4; {left}" in err
     assert volume(out).shape == (3, 22, 40)
     code, err = command("reconstruct", path, "--out", out)
     assert code == 2
@@ -552,7 +562,7 @@ def test_an_interrupted_run_by_tiles_goes_on_where_it_was(workplace, tmp_path, m
 
 
 def interrupt_in_tile(patch, tile, number):
-    """Make the next run stop with KeyboardInterrupt in one of its tiles, counted from 0, when it would take a step."""
+    """Make the next run stop with KeyboardInterrupt in one of its fits, counted from 0, when it would take a step."""
     original, begun = recorded.minimise, []
 
     def minimise(*arguments):

@@ -79,13 +79,15 @@ class TiledFit:
 
     @property
     def following(self) -> list[Visit]:
-        """The fits that go by what the leaders have found: their own again, and those of the other tiles.
+        """The fits that go by what the leaders have found: their own again, and those of the other tiles."""
+        leading = self.leading if self.shares_weight else []
+        again = [Visit(visit.tile, again=True) for visit in leading]
+        return [*again, *map(Visit, self.tiles[len(self.leading) :])]
 
-        A lone leader has nothing to take over from others.
-        """
-        leading = self.leading
-        again = leading if len(leading) > 1 and self.priors.weight is not None else []
-        return [*(Visit(visit.tile, again=True) for visit in again), *map(Visit, self.tiles[len(leading) :])]
+    @property
+    def shares_weight(self) -> bool:
+        """Whether leaders, which are fitted, have found a weight together; a lone one has nothing to take over."""
+        return len(self.leading) > 1 and self.priors.weight is not None
 
     def fitted(self) -> Tiled:
         """Make the fits that have yet to be made, and put all tiles together.
@@ -96,7 +98,7 @@ class TiledFit:
         first, *leading = self.leading
         forecast = Forecast(self.problem(first))
         if self.kept(first) is None:
-            again = AGAIN * len(leading) / ranks()
+            again = AGAIN * len(self.leading) / ranks() if leading else 0.0
             tell_foreseen(self.problem(first), forecast, tiles=math.ceil(len(self.tiles) / ranks()), more=again)
             self.fit(first, forecast)
         self._fit_missing(leading, forecast)
@@ -118,14 +120,14 @@ class TiledFit:
         folder, identity, problem = folder_of(self.out, visit), self.identity_of(visit), self.problem(visit)
         with _told():
             self._prepare(folder)
-        start = begun(folder, identity)
+        start, left = begun(folder, identity), forecast.of_another(problem) if visit.again else forecast
 
         def leave(step: Step) -> str:
             # of several processes, the first leaves it for all
             return self.leave_so_far(visit, step) if rank() == 0 else "its Δn so far is in the checkpoint"
 
         try:
-            ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave, forecast)
+            ended = descend_recorded(problem, folder, self.checkpoint_every, identity, start, leave, left)
         except InterruptedRunError as error:
             raise InterruptedRunError(f"tile {visit}: {error}") from None
         except STOPPING as error:
@@ -163,7 +165,7 @@ class TiledFit:
             return ""
         if visit in self.leading:
             first = self.learned.finding
-            return f"scale of weight {first.weight}, contrast {first.contrast}"
+            return f"what the first has learned, of weight {first.weight} and contrast {first.contrast}"
         priors = self.priors
         way = "at once" if visit.again else f"from {priors.least} on"
         return f"weight {priors.weight} {way}, contrast {priors.contrast}"
@@ -233,7 +235,7 @@ class TiledFit:
         first, delta = self.found(self.leading[0]), self.volume((v.tile, self.found(v)) for v in self.last)
         values = {**self.learned.values, IndexDifference.name: delta}
         weights = first.step.weights
-        if self.priors.weight is not None:
+        if self.shares_weight:
             weights = (*weights, record(first.step.number, self.priors.weight, "the leading tiles' mean"))
         whole = replace(first.step, delta=delta, values=values, seconds=sum(seconds.values()), weights=weights)
         axes = self.layout.along_y, self.layout.along_x
@@ -268,4 +270,4 @@ def _told() -> Iterator[None]:
 def _fit_share(fit: TiledFit, visits: Sequence[Visit], forecast: Forecast) -> None:
     """Make a process' share of some fits. forecast: of the time left of one."""
     for visit in visits[rank() :: ranks()]:
-        fit.fit(visit, forecast.of_another(fit.problem(visit)) if visit.again else forecast)
+        fit.fit(visit, forecast)
