@@ -1,6 +1,7 @@
 """The time left of a descent: known kinds of steps by their own seconds, others by what they cost."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -96,6 +97,29 @@ def test_a_specimen_in_which_few_directions_mislead_is_foreseen_to_take_longer(m
     assert costs[:COARSE_STEPS] == costs_of_all[:COARSE_STEPS]
     assert all(more > less for less, more in zip(costs[COARSE_STEPS:], costs_of_all[COARSE_STEPS:], strict=True))
     assert longer > 1.3 * usual
+
+
+def going_on(made):
+    """The same problem, from a volume that is known."""
+    nothing = torch.zeros(made.setup.volume.grid.shape)
+    return replace(made, unknowns=[replace(made.unknowns[0], given=nothing), *made.unknowns[1:]])
+
+
+def test_a_descent_that_goes_on_from_a_volume_has_no_steps_of_the_fewest_directions():
+    made = problem(steps=20)
+    usual, onward = Forecast(made), Forecast(going_on(made))
+    assert onward.cost(1) == usual.cost(COARSE_STEPS + 1) > usual.cost(1)
+    assert onward.cost(0) == usual.cost(COARSE_STEPS) > onward.cost(1)  # with all that such steps begin with
+
+
+def test_another_descents_steps_take_what_those_of_the_first_have_taken():
+    made = problem(steps=20)
+    first = Forecast(made)
+    for number in range(1, 7):
+        first.taken(number, 0.01 * first.cost(number - 1))
+    other = first.of_another(going_on(replace(made, steps=6)))
+    assert not other.untried
+    assert other.left(0) == pytest.approx(0.01 * sum(other.cost(number) for number in range(6)))
 
 
 def test_a_kind_of_step_that_was_seen_is_known_by_its_own_seconds():
