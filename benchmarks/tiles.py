@@ -1,6 +1,6 @@
 """A field fitted in tiles beside the same field fitted whole: how far apart they are, at the seams too, and the cost.
 
-    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...] [--pixels 288] [--steps 20]
+    OMP_NUM_THREADS=1 python benchmarks/tiles.py [--out tiles] [--scenes NAME ...] [--pixels 288] [--across 2]
 
 Images come from a finer model than the fits', with noise (`scenes.py`). Each field has specimens on its seams. "apart"
 is the distance of the two volumes over the whole fit's length, "at seams" the same of the voxels in which two tiles are
@@ -140,6 +140,7 @@ def fitted_in_tiles(problem: Problem, layout: Layout, noise: tuple[float, ...], 
     began, folder = time.process_time(), out / "kept"
     fit = TiledFit(problem, layout, tuple(strongest_first(layout, problem.misfit)), noise, folder, "", problem.steps)
     prepare_folder(folder)
+    forget(folder)  # of a run that was stopped
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # bars and lines of each tile
         tiled = fit.fitted()
     first, last = tiled.first, tiled.ended.step
@@ -214,12 +215,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("tiles"))
     parser.add_argument("--scenes", nargs="+", choices=names, default=names)
     parser.add_argument("--pixels", type=int, default=288, help="of the field along a side")
+    parser.add_argument("--across", type=int, default=2, help="tiles along a side")
     parser.add_argument("--steps", type=int, help="of each fit at most")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     warnings.simplefilter("ignore")
     field = field_of(options.pixels)
-    margin, side = margin_beyond(field, scenes.MICROSCOPE, 1.36), (options.pixels + SHARED) // 2
+    margin = margin_beyond(field, scenes.MICROSCOPE, 1.36)
+    side = (options.pixels + (options.across - 1) * SHARED) // options.across
     layout = Layout.of(field, field, side, margin, OVERLAP * margin)
     print(f"{len(layout)} tiles of {side} voxels, margin {margin}, overlap {SHARED} of {field.shape}\n{HEAD}")
     for name in options.scenes:

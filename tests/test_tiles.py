@@ -16,6 +16,7 @@ from results import BESIDE
 from test_reconstruct import command, content, interrupt_at, volume
 
 from recon.config.reading import load
+from recon.config.schema import ConfigError
 from recon.descend import Problem, Recipe, minimise
 from recon.fit.nuisances.light import Lamp
 from recon.fit.setup import Setup, empty_medium
@@ -28,7 +29,7 @@ from recon.prior.weight import record
 from recon.recording.noise import NoiseModel
 from recon.run import recorded
 from recon.run.tiles import sizes
-from recon.run.tiles.fitting import TiledFit
+from recon.run.tiles.fitting import TiledFit, tiles_to_fit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
@@ -159,14 +160,36 @@ def test_a_misfit_is_the_mean_of_its_parts(kind, masked):
     total = 0.0
     for rows in (slice(0, 8), slice(8, 20)):
         part = whole.part(rows, slice(None), whole)
-        if kind == 0:  # the prisms are averaged, each over its own pixels
-            weight = part.pixels / whole.pixels
-            squares = part.prism_means((part.counted(images[:, :, rows]) - part.data).square())
-            assert float(part(images[:, :, rows])) == pytest.approx(float((squares / part.variance.flatten()).mean()))
-            total += float((weight * squares / whole.variance.flatten()).mean())
-        else:
-            total += float(part(images[:, :, rows]) * part.pixels.sum() / whole.pixels.sum())
+        # of kind 0 the prisms are averaged, each over its own pixels
+        weight = (part.pixels / whole.pixels).mean() if kind == 0 else part.pixels.sum() / whole.pixels.sum()
+        total += float(part(images[:, :, rows]) * weight)
     assert total == pytest.approx(float(whole(images)), rel=2e-2 if kind == 1 else 1e-12)
+
+
+def test_a_prism_of_which_few_pixels_count_in_a_part_counts_there_for_little():
+    """As in the whole: a pixel's pull there keeps its ratio to that of any other prism's."""
+    data = 1 + 0.05 * torch.randn(2, 3, 20, 16, dtype=torch.float64, generator=generator(2))
+    mask = torch.ones(data.shape, dtype=torch.bool)
+    mask[1, :, :, :8] = False
+    mask[1, 0, 4, 4] = True
+    whole = GaussianMisfit(data, None, mask)
+    part = whole.part(slice(2, 18), slice(0, 8), whole)
+    again = part.part(slice(1, 9), slice(1, 7), part)
+
+    def pulls(misfit, row, column):
+        images = misfit.data + 0.1
+        images.requires_grad_()
+        misfit(images).backward()
+        assert torch.equal(misfit.curvature(images) > 0, images.grad > 0)
+        assert torch.allclose(misfit.curvature(images) * 0.1, images.grad)
+        return float(images.grad[0, 0, row, column] / images.grad[1, 0, row, column])
+
+    expected = pulls(whole, 4, 4)
+    assert pulls(part, 2, 4) == pytest.approx(expected)
+    assert pulls(again, 1, 3) == pytest.approx(expected)
+    noise = [0.01, 0.02]
+    residual = torch.tensor(noise, dtype=torch.float64)[:, None, None, None]
+    assert part.of_noise(noise) == pytest.approx(float(part(part.data + residual)))
 
 
 def test_an_empty_part_has_a_misfit_in_the_units_of_another():
@@ -340,15 +363,53 @@ def test_tiles_lead_that_can_find_a_weight(field):
     whole, _ = field
     grid = replace(FIELD, shape=(5, 24, 130))
     layout = layout_of(grid, 30, 5, 10)
-    data = torch.nn.functional.pad(whole.misfit.data, (0, 66), value=1.0)
+    noise = NOISE * torch.randn(2, 3, 24, 66, generator=generator(10))
+    data = torch.cat([whole.misfit.data, whole.misfit.data.mean((2, 3), keepdim=True) + noise], 3)
     setup = replace(whole.setup, volume=empty_medium(grid, 1.33, data))
     wide = replace(whole, misfit=GaussianMisfit(data), setup=setup)
     tiles = strongest_first(layout, wide.misfit)
-    shown = [tile for tile in tiles if tile.columns.pixels.start < 64]
-    assert 1 < len(shown) < len(tiles)
-    assert leaders(wide, tiles) == shown[:LEADERS]
+    assert len(tiles) > 3
+    shown = [tile for tile in tiles if tile.columns.pixels.start < 60]
+    assert leaders(wide, tiles) == shown[:LEADERS]  # noise alone leads nobody
     assert leaders(replace(wide, weight=None), tiles) == tiles[:1]
     assert leaders(replace(wide, method="adam"), tiles) == tiles[:1]
+    # a tile in which the images of a prism are uniform finds nothing by itself, however much the other one shows
+    flat = data.clone()
+    first = shown[0].columns.pixels
+    flat[1, :, :, first] = 0.5
+    flat[0, :, :, first] *= 1 + torch.linspace(0, 0.5, 24)[:, None]
+    other = replace(wide, misfit=GaussianMisfit(flat))
+    again = strongest_first(layout, other.misfit)
+    assert again[0] == shown[0]
+    assert leaders(other, again)[0] != shown[0]
+    assert shown[0] not in leaders(other, again)
+
+
+def test_a_uniform_tile_among_the_leaders_is_fitted_all_the_same(field, tmp_path):
+    """Each tile is fitted once at least, whichever lead."""
+    whole, _ = field
+    layout = layout_of(FIELD, 30, 5, 10)
+    tiles = strongest_first(layout, whole.misfit)
+    assert len(tiles) == 3
+    data = whole.misfit.data.clone()
+    data[1, :, :, tiles[0].columns.pixels] = 1.0
+    flat = replace(whole, misfit=GaussianMisfit(data), steps=1)
+    fit = TiledFit(flat, layout, tuple(tiles), [NOISE] * 2, tmp_path, "these tiles", 1)
+    found = fit.fitted()
+    assert fit.leading[0].tile != tiles[0]
+    assert fit.others[0].tile == tiles[0]
+    assert min(found.record["steps"].values()) == 1
+
+
+def test_a_field_whose_tiles_all_have_uniform_images_is_refused(field):
+    whole, _ = field
+    layout = layout_of(FIELD, 30, 5, 10)
+    data = torch.ones_like(whole.misfit.data)
+    data[0, :, :, 0], data[1, :, :, -1] = 1.1, 1.1
+    with pytest.raises(
+        ConfigError, match=r"none of 3 tiles can be fitted by itself: in each the images of a prism are"
+    ):
+        tiles_to_fit(replace(whole, misfit=GaussianMisfit(data)), layout)
 
 
 def test_the_first_tiles_weight_goes_by_the_pixels_that_count_in_the_field(field):

@@ -33,6 +33,7 @@ class GaussianMisfit(Misfit):
     ) -> None:
         super().__init__(data, mask, unit)
         self.noise = noise
+        self._shares = torch.ones_like(self.variance.flatten())  # of the prisms, 1 on average
         if noise is None:
             return
         model = noise.like(self.data)
@@ -53,21 +54,28 @@ class GaussianMisfit(Misfit):
         return type(self)(data, self.noise, self.mask)
 
     def part(self, rows: slice, columns: slice, unit: Misfit | None = None) -> "GaussianMisfit":
-        """The misfit of a part of the images, see `Misfit.part`."""
+        """The misfit of a part of the images, see `Misfit.part`.
+
+        Without a noise model a prism of which few pixels count there counts for less, as it would in the whole.
+        """
         noise = None if self.noise is None else self.noise.part(rows, columns)
-        return GaussianMisfit(self.data[..., rows, columns], noise, self._mask_of_part(rows, columns), unit)
+        part = GaussianMisfit(self.data[..., rows, columns], noise, self._mask_of_part(rows, columns), unit)
+        shares = self._shares * part.pixels / self.pixels
+        part._shares = shares / shares.mean()
+        return part
 
     def __call__(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, ""]:
         """The misfit of modelled images, in the unit of the data; differentiable."""
         squares = (self.counted(images) - self.data).square()
         if self.noise is None:
-            return (self.prism_means(squares) / self.variance.flatten()).mean()
+            return (self._shares * self.prism_means(squares) / self.variance.flatten()).mean()
         return self.mean(squares / self._divisor)
 
     def curvature(self, images: Float[Tensor, "prism focus y x"]) -> Float[Tensor, "#prism #focus #y #x"]:
         """Twice each pixel's weight, whatever the images: the misfit is a parabola."""
         if self.noise is None:
-            return self.where_counted(2 / (self.pixels[:, None, None, None] * len(self.data) * self.variance))
+            weight = 2 * self._shares / (self.pixels * len(self.data))
+            return self.where_counted(weight[:, None, None, None] / self.variance)
         return self.where_counted(2 / (self.pixels.sum() * self._divisor))
 
     def of_noise(self, noise: Sequence[float] | None = None) -> float | None:
@@ -79,5 +87,5 @@ class GaussianMisfit(Misfit):
             return float(self._noise_alone / self._empty)
         if noise is None:
             return None
-        variances = self.variance.flatten().tolist()
-        return sum(n**2 / v for n, v in zip(noise, variances, strict=True)) / len(variances)
+        variances, shares = self.variance.flatten().tolist(), self._shares.tolist()
+        return sum(s * n**2 / v for s, n, v in zip(shares, noise, variances, strict=True)) / len(variances)

@@ -35,6 +35,10 @@ FILLED = 0.25
 # Below it the volume has followed the noise.
 FOLLOWS = 0.9
 
+# Above it a misfit is more than an empty medium's, which is 1: brightness that was found in a part of the images
+# is off by the noise.
+EMPTY = 1.001
+
 # A residual whose high frequencies are by more than this part weaker or stronger than all has structure.
 WHITE = 0.1
 
@@ -102,7 +106,7 @@ class Verdict:
         A descent that was asked for few steps, or still falls, says itself that it isn't at its end.
         """
         unfinished = bool(self.causes) and self.causes[0].name == FEW
-        return self.poor and (self.misfit > 1 or (self.expected and not unfinished))
+        return self.poor and (self.misfit > EMPTY or (self.expected and not unfinished))
 
     def with_volume(self, delta: Float[Tensor, "z y x"]) -> "Verdict":
         """The verdict with what the volume itself says: whether most of it isn't the medium, and where it ends."""
@@ -126,7 +130,7 @@ class Verdict:
 
     def _judgement(self) -> str:
         residual = "white" if abs(self.white - 1) < WHITE else f"structured (whiteness {self.white:.2g})"
-        if self.misfit > 1:
+        if self.misfit > EMPTY:
             empty = "empty medium would explain the stack better; the optics may not be those of the stack"
             return f"{empty}; {self._likeliest()}" if self.causes else empty
         if self.poor and not self.expected:
@@ -195,7 +199,7 @@ class Verdict:
 
 def leaves_too_much(misfit: float, noise: float | None) -> bool:
     """Whether a misfit is above what noise leaves and a right model may add. noise: None where it isn't known."""
-    if misfit > 1 or not math.isfinite(misfit):
+    if misfit > EMPTY or not math.isfinite(misfit):
         return True
     return noise is not None and misfit > LIMIT * noise and _unexplained(misfit, noise) > LEAST
 

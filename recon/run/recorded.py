@@ -33,17 +33,17 @@ STOPPING = (FloatingPointError, ValueError, MemoryError, RuntimeError, ImportErr
 LONG = 60.0
 
 
-def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, tiles: int = 1, more: float = 0.0) -> None:
+def tell_foreseen(problem: Problem, forecast: Forecast, number: int = 0, descents: float = 1.0, of: str = "") -> None:
     """Print what a descent will take, after a trial; nothing where its fidelity has yet to be planned.
 
-    number: steps so far. tiles: descents like this one. more: what comes on top of them, in such descents.
-    Raises as the images of a step do.
+    number: steps so far. descents: such as this one. of: what is done by them, in words. Raises as the images of a
+    step do.
     """
     seconds = forecast.whole(number)
     if seconds is None:
         return
-    seconds *= tiles + more
-    words = f"foreseen: {spoken(seconds)}{f' for {tiles} tiles' if tiles > 1 else ''}"
+    seconds *= descents
+    words = f"foreseen: {spoken(seconds)}{of}"
     if seconds > LONG:
         words += f" and {bytes_held(problem, GaussianMisfit) / GIB:.2g} GiB"
     if problem.method == "newton" and problem.steps > USUAL_STEPS:

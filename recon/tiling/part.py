@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from recon.fit.nuisances.light import Lamp
@@ -21,30 +22,43 @@ from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors, is_of_til
 # Leaders at most. More of them agree more closely, and each costs its tile half as many steps again.
 LEADERS = 4
 
+# A leader shows at least this share of what the first one shows beyond the noise. An empty tile finds nothing.
+LEADS = 0.1
+
 # Steps at most in which a tile goes on with another weight. Four or five do; what is left is far below the noise.
 STEPS_AGAIN = 6
 
 
 def strongest_first(layout: Layout, misfit: Misfit) -> list[Tile]:
     """The tiles in the order in which they are fitted: by how much their images show."""
-    contrast = misfit.where_counted(misfit.data - image_means(misfit.data, misfit.mask)).square()
-    power = (contrast / misfit.variance).mean((0, 1))
-
-    def shown(tile: Tile) -> float:
-        return float(power[tile.rows.pixels, tile.columns.pixels].sum())
-
-    return sorted(layout, key=shown, reverse=True)
+    power = _power(misfit)
+    return sorted(layout, key=lambda tile: _shown(power, tile), reverse=True)
 
 
 def leaders(whole: Problem, tiles: Sequence[Tile]) -> list[Tile]:
-    """The first of some tiles, which find what all share; they are given as `strongest_first` has them.
+    """Those of some tiles that find what all share, the first tile first; none where each has uniform images.
 
     One leads where there is no weight to be found, or where the descent can't go on from a volume: Adam's rate has
-    fallen to nothing by the end of its steps. Tiles whose images are uniform find nothing. whole: as in `lacks`.
+    fallen to nothing by the end of its steps. whole: as in `lacks`. tiles: as `strongest_first` has them.
     """
-    if whole.weight is None or whole.method != "newton":
+    if whole.weight is None:
         return list(tiles[:1])
-    return [tiles[0], *(tile for tile in tiles[1:LEADERS] if not _is_uniform(whole.misfit, tile))]
+    able = (tile for tile in tiles if not _is_uniform(whole.misfit, tile))
+    found = list(islice(able, LEADERS if whole.method == "newton" else 1))
+    power = _power(whole.misfit) - (whole.weight.noise_misfit or 0.0)
+    shown = [_shown(power, tile) for tile in found]
+    return [tile for tile, own in zip(found, shown, strict=True) if tile == found[0] or own > LEADS * max(shown[0], 0)]
+
+
+def _power(misfit: Misfit) -> Float[Tensor, "y x"]:
+    """What the images show at each pixel: the square of their contrast, over its mean."""
+    contrast = misfit.where_counted(misfit.data - image_means(misfit.data, misfit.mask)).square()
+    return (contrast / misfit.variance).mean((0, 1))
+
+
+def _shown(power: Float[Tensor, "y x"], tile: Tile) -> float:
+    """What the images of a tile show together."""
+    return float(power[tile.rows.pixels, tile.columns.pixels].sum())
 
 
 def without_margin(problem: Problem) -> Problem:

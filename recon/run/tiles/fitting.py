@@ -1,6 +1,5 @@
 """A field fitted tile by tile, and what its tiles say together."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -49,6 +48,11 @@ def tiles_to_fit(whole: Problem, layout: Layout) -> tuple[Tile, ...]:
             f"reconstruction.tiles: none of {len(told)} tiles can be fitted: in tile {first} {reason}; take larger "
             "tiles, or leave out less of the images"
         )
+    if not leaders(whole, found):
+        raise ConfigError(
+            f"reconstruction.tiles: none of {len(found)} tiles can be fitted by itself: in each the images of a prism "
+            "are uniform; take larger tiles"
+        )
     for tile, reason in told:
         if reason is not None:
             print(f"tile {tile}: {reason}: Δn stays 0 there")
@@ -80,9 +84,13 @@ class TiledFit:
     @property
     def following(self) -> list[Visit]:
         """The fits that go by what the leaders have found: their own again, and those of the other tiles."""
-        leading = self.leading if self.shares_weight else []
-        again = [Visit(visit.tile, again=True) for visit in leading]
-        return [*again, *map(Visit, self.tiles[len(self.leading) :])]
+        again = [Visit(visit.tile, again=True) for visit in self.leading if self.shares_weight]
+        return [*again, *self.others]
+
+    @property
+    def others(self) -> list[Visit]:
+        """The fits of the tiles that don't lead."""
+        return [visit for visit in map(Visit, self.tiles) if visit not in self.leading]
 
     @property
     def shares_weight(self) -> bool:
@@ -96,10 +104,13 @@ class TiledFit:
         folder, and ResultsError where a fitted tile can't be kept.
         """
         first, *leading = self.leading
-        forecast = Forecast(self.problem(first))
-        if self.kept(first) is None:
-            again = AGAIN * len(self.leading) / ranks() if leading else 0.0
-            tell_foreseen(self.problem(first), forecast, tiles=math.ceil(len(self.tiles) / ranks()), more=again)
+        is_there, forecast = self.kept(first) is not None, Forecast(self.problem(first))
+        if left := self._left():
+            number = len({visit.tile.number for visit in left})
+            of = f" for {number} tile{'s' if number > 1 else ''}{f' by {ranks()} processes' if ranks() > 1 else ''}"
+            descents = sum(AGAIN if visit.again else 1.0 for visit in left)
+            tell_foreseen(self.problem(first), forecast, descents=descents / ranks(), of=of)
+        if not is_there:
             self.fit(first, forecast)
         self._fit_missing(leading, forecast)
         self._fit_missing(self.following, forecast)
@@ -107,16 +118,21 @@ class TiledFit:
 
     def _fit_missing(self, visits: Sequence[Visit], forecast: Forecast) -> None:
         """Make those of some fits that have yet to be made, shared out among the processes."""
-        missing = [visit for visit in visits if self.kept(visit) is None]
+        if missing := [visit for visit in visits if self.kept(visit) is None]:
+            everywhere(_fit_share, self, missing, forecast)
+
+    def _left(self) -> list[Visit]:
+        """The fits that are probably left to be made: too few steps find no weight to go on with."""
+        missing = [visit for visit in self.leading if not is_kept(folder_of(self.out, visit))]
         if not missing:
-            return
-        if forecast.untried:
-            tell_foreseen(self.problem(missing[0]), forecast, tiles=math.ceil(len(missing) / ranks()))
-        everywhere(_fit_share, self, missing, forecast)
+            return [visit for visit in self.following if not is_kept(folder_of(self.out, visit))]
+        again = [Visit(visit.tile, again=True) for visit in self.leading]
+        return [*missing, *(again if len(again) > 1 else []), *self.others]
 
     def fit(self, visit: Visit, forecast: Forecast) -> None:
         """Fit one tile and keep it. forecast: of the time left. Raises as `fitted` does."""
-        print(f"tile {visit}, {self.tiles.index(visit.tile) + 1} of {len(self.tiles)}")
+        number = f"{self.tiles.index(visit.tile) + 1} of {len(self.tiles)}"
+        print(f"tile {visit}, {f'by what {len(self.leading)} tiles have found' if visit.again else number}")
         folder, identity, problem = folder_of(self.out, visit), self.identity_of(visit), self.problem(visit)
         with _told():
             self._prepare(folder)
@@ -213,7 +229,7 @@ class TiledFit:
 
     @property
     def last(self) -> list[Visit]:
-        """The last fit of each tile, in the tiles' order."""
+        """The last fit of each tile."""
         return list({visit.tile.number: visit for visit in [*self.leading, *self.following]}.values())
 
     def so_far(self) -> Iterator[tuple[Tile, Checkpoint]]:
