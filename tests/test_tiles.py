@@ -31,10 +31,10 @@ from recon.run import recorded
 from recon.run.tiles import sizes
 from recon.run.tiles.fitting import TiledFit, tiles_to_fit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
+from recon.tiling import part
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
 from recon.tiling.part import (
-    LEADERS,
     finding_of,
     gone_on_with,
     lacks,
@@ -359,7 +359,7 @@ def test_a_leaders_weight_means_the_same_in_the_first_tiles_scale(field, kind):
     assert found.weight != pytest.approx(30.0, rel=0.005)
 
 
-def test_tiles_lead_that_can_find_a_weight(field):
+def test_tiles_lead_that_can_find_a_weight(field, monkeypatch):
     whole, _ = field
     grid = replace(FIELD, shape=(5, 24, 130))
     layout = layout_of(grid, 30, 5, 10)
@@ -370,7 +370,9 @@ def test_tiles_lead_that_can_find_a_weight(field):
     tiles = strongest_first(layout, wide.misfit)
     assert len(tiles) > 3
     shown = [tile for tile in tiles if tile.columns.pixels.start < 60]
-    assert leaders(wide, tiles) == shown[:LEADERS]  # noise alone leads nobody
+    assert leaders(wide, tiles) == shown  # noise alone leads nobody
+    monkeypatch.setattr(part, "ENOUGH", 2 * 2 * 3 * 24 * 30 - 1)  # a pixel less than two tiles have
+    assert leaders(wide, tiles) == shown[:2]
     assert leaders(replace(wide, weight=None), tiles) == tiles[:1]
     assert leaders(replace(wide, method="adam"), tiles) == tiles[:1]
     # a tile in which the images of a prism are uniform finds nothing by itself, however much the other one shows
