@@ -267,7 +267,7 @@ def test_tiles_make_the_volume_that_the_whole_field_makes(field, tmp_path):
 
 def learned_of(whole):
     """What a first tile may say of a field."""
-    return LearnedByFirst(whole.misfit, {"brightness": torch.full((2, 3), 1.02)}, Finding(70.0, 40.0, 0.012, 1.0))
+    return LearnedByFirst(whole.misfit, {"brightness": torch.full((2, 3), 1.02)})
 
 
 def test_a_leader_finds_its_own_weight_in_its_own_scale(field):

@@ -72,7 +72,8 @@ def load(path: Path, identity: str) -> Checkpoint:
         if is_shortage(error):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise CheckpointError(f"{path}: is no checkpoint of this version: {reason}") from error
+        advice = "remove it, and what it holds is computed again, or begin anew with --restart"
+        raise CheckpointError(f"{path}: is no checkpoint of this version: {reason}; {advice}") from error
     if checkpoint is None:
         raise CheckpointError(
             f"{path}: is a checkpoint of an earlier version, from which this one can't go on; begin anew with --restart"

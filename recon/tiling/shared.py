@@ -49,19 +49,17 @@ class LearnedByFirst:
     """What the first tile's fit says of all tiles.
 
     misfit: whose scale is that of all. values: of what was learned beside Δn, by name, but for the lamp: an uneven one
-    is another one in each tile. finding: of the specimen in it.
+    is another one in each tile.
     """
 
     misfit: Misfit
     values: dict[str, Tensor]
-    finding: Finding
 
     @classmethod
     def by(cls, problem: Problem, last: Step) -> "LearnedByFirst":
         """What a finished fit says. problem: the first tile's. last: its last step."""
         own = {unknown.name for unknown in problem.unknowns if is_of_tile(unknown)}
-        values = {name: value for name, value in last.values.items() if name not in own}
-        return cls(problem.misfit, values, Finding.by(last))
+        return cls(problem.misfit, {name: value for name, value in last.values.items() if name not in own})
 
 
 def is_of_tile(unknown: Unknown) -> bool:

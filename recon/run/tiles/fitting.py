@@ -7,6 +7,7 @@ from functools import cached_property
 from itertools import chain
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -179,12 +180,13 @@ class TiledFit:
         """What a tile's fit takes over from others, in words."""
         if visit == self.leading[0]:
             return ""
+        sums = {"scale": self.learned.misfit.variance, **self.learned.values}
+        learned = ", ".join(f"{name} {float(value.sum(dtype=torch.float64))}" for name, value in sums.items())
         if visit in self.leading:
-            first = self.learned.finding
-            return f"what the first has learned, of weight {first.weight} and contrast {first.contrast}"
+            return learned
         priors = self.priors
         way = "at once" if visit.again else f"from {priors.least} on"
-        return f"weight {priors.weight} {way}, contrast {priors.contrast}"
+        return f"{learned}, weight {priors.weight} {way}, contrast {priors.contrast}"
 
     @cached_property
     def learned(self) -> LearnedByFirst:
