@@ -149,9 +149,14 @@ class Scene:
         with self.started(out, *options, by=by) as running:
             return running.ended()
 
-    def check_as_whole(self, out: Path) -> None:
-        """What is in a folder is what the run to which nothing happened has left."""
-        names = {path.name for path in out.iterdir()} - {".lock"}  # of a run that was killed
+    def check_as_whole(self, out: Path, killed: bool = False) -> None:
+        """What is in a folder is what the run to which nothing happened has left.
+
+        killed: whether it was, at its end, and may have left what the next run in the folder removes.
+        """
+        names = {path.name for path in out.iterdir()} - {".lock"}
+        if killed:
+            names = {name for name in names if not name.startswith(PARTIAL)}
         assert names == self.launch.results
         for name in ("volume.ome.tif", "images.ome.tif"):
             ours, theirs = (tifffile.imread(folder / name) for folder in (out, self.whole))

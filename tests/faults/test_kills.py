@@ -56,7 +56,7 @@ def check_goes_on(scene, out):
     steps = scene.taken(out) - scene.saved(out)
     assert 0 <= steps <= EVERY
     if scene.is_finished(out):
-        scene.check_as_whole(out)
+        scene.check_as_whole(out, killed=True)
     else:
         scene.check_resumed(out)
     return steps
