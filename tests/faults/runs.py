@@ -18,6 +18,8 @@ import tifffile
 import torch
 from results import RESULTS
 
+from torchdic.files.whole import PARTIAL
+
 # A module, or in place of it a script that breaks something and runs the module.
 TORCHDIC = ("-m", "recon")
 HERE = Path(__file__).parent
