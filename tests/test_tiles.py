@@ -603,7 +603,7 @@ def test_a_run_by_tiles_leaves_what_any_run_leaves(workplace):
 @pytest.mark.parametrize(
     ("fit", "number", "tile", "there"),
     [
-        (0, 3, "1-1", 0),
+        pytest.param(0, 3, "1-1", 0, marks=pytest.mark.slow),
         pytest.param(1, 2, "1-2", 1, marks=pytest.mark.slow),
         (2, 2, "1-1 again", 1),
         pytest.param(3, 2, "1-2 again", 1, marks=pytest.mark.slow),
