@@ -41,7 +41,7 @@ from recon.run.tiles.fitting import TiledFit
 from recon.run.tiles.kept import forget
 from recon.run.tiles.sizes import OVERLAP
 from recon.tiling.layout import Layout
-from recon.tiling.part import strongest_first
+from recon.tiling.leaders import strongest_first
 from specimens import GradedEllipsoid, Together, moved
 from torchdic import Grid
 

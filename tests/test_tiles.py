@@ -31,16 +31,15 @@ from recon.run import recorded
 from recon.run.tiles import sizes
 from recon.run.tiles.fitting import TiledFit, tiles_to_fit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
-from recon.tiling import part
+from recon.tiling import leaders as leaders_room
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import ALIGNED, Axis, Layout
+from recon.tiling.leaders import leaders, strongest_first
 from recon.tiling.part import (
     finding_of,
     gone_on_with,
     lacks,
-    leaders,
     problem_of_tile,
-    strongest_first,
     without_margin,
 )
 from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors
@@ -371,7 +370,7 @@ def test_tiles_lead_that_can_find_a_weight(field, monkeypatch):
     assert len(tiles) > 3
     shown = [tile for tile in tiles if tile.columns.pixels.start < 60]
     assert leaders(wide, tiles) == shown  # noise alone leads nobody
-    monkeypatch.setattr(part, "ENOUGH", 2 * 2 * 3 * 24 * 30 - 1)  # a pixel less than two tiles have
+    monkeypatch.setattr(leaders_room, "ENOUGH", 2 * 2 * 3 * 24 * 30 - 1)  # a pixel less than two tiles have
     assert leaders(wide, tiles) == shown[:2]
     assert leaders(replace(wide, weight=None), tiles) == tiles[:1]
     assert leaders(replace(wide, method="adam"), tiles) == tiles[:1]

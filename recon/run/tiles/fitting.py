@@ -25,7 +25,8 @@ from recon.run.results import GO_ON, ResultsError, Tiled, leave_interrupted, mod
 from recon.run.tiles.kept import FITTED, begun, folder_of, identity_of, is_kept, keep, kept, prepared, remember_side
 from recon.tiling.blending import blended_images, blended_volume
 from recon.tiling.layout import Layout, Tile
-from recon.tiling.part import finding_of, gone_on_with, lacks, leaders, problem_of_tile, strongest_first
+from recon.tiling.leaders import leaders, strongest_first
+from recon.tiling.part import finding_of, gone_on_with, lacks, problem_of_tile
 from recon.tiling.shared import Finding, LearnedByFirst, SharedPriors
 from recon.tiling.visits import Visit
 from torchdic.files.whole import WriteError
