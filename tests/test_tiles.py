@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from distant import Device, bring, send
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from results import BESIDE
@@ -28,6 +29,7 @@ from recon.prior.base import contrast
 from recon.prior.weight import record
 from recon.recording.noise import NoiseModel
 from recon.run import recorded
+from recon.run.tiles import kept as kept_room
 from recon.run.tiles import sizes
 from recon.run.tiles.fitting import TiledFit, tiles_to_fit
 from recon.run.tiles.sizes import cut_of, least_side, margin_of_tiles
@@ -238,6 +240,7 @@ def solved(problem):
 
 def fitted(whole, layout, out):
     """The field fitted tile by tile, with its tiles kept in a folder."""
+    out.mkdir(exist_ok=True)
     tiles = tuple(strongest_first(layout, whole.misfit))
     return TiledFit(whole, layout, tiles, [NOISE] * 2, out, "these tiles", whole.steps)
 
@@ -286,6 +289,31 @@ def test_a_leader_finds_its_own_weight_in_its_own_scale(field):
         assert problem.contrast is None
         assert problem.weight.inside is not None
         assert (problem.weight.first, problem.weight.towards, problem.weight.held) == (None, None, False)
+
+
+@pytest.mark.slow
+def test_tiles_are_fitted_on_another_device_as_on_this_one(field, tmp_path, monkeypatch):
+    """As on a GPU: two lead, and go on; what is kept is read onto the CPU."""
+    original = kept_room.save
+
+    def saved(path, ended):
+        values = {name: bring(value) for name, value in ended.step.values.items()}
+        step = replace(ended.step, delta=bring(ended.step.delta), values=values)
+        original(path, replace(ended, step=step))
+
+    whole, _ = field
+    layout = layout_of(FIELD, 40, 5, 10)
+    here = fitted(replace(whole, steps=4), layout, tmp_path / "here").fitted()
+    monkeypatch.setattr(kept_room, "save", saved)
+    with Device():
+        data = send(whole.misfit.data)
+        setup = Setup(empty_medium(FIELD, 1.33, data), MICROSCOPE, ACQUISITION)
+        there = Problem.from_recipe(data, setup, FIDELITY, Recipe(steps=4), GaussianMisfit, [NOISE] * 2)
+        found = fitted(there, layout, tmp_path / "there").fitted()
+    assert len(here.record["steps"]) == 2
+    assert found.record["steps"] == here.record["steps"]
+    assert distance(found.ended.step.delta, here.ended.step.delta) < 1e-4
+    assert distance(found.images, here.images) < 1e-4
 
 
 def test_other_tiles_take_over_what_the_leaders_have_found(field):

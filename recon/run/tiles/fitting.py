@@ -182,7 +182,7 @@ class TiledFit:
         if visit == self.leading[0]:
             return ""
         sums = {"scale": self.learned.misfit.variance, **self.learned.values}
-        learned = ", ".join(f"{name} {float(value.sum(dtype=torch.float64))}" for name, value in sums.items())
+        learned = ", ".join(f"{name} {float(value.cpu().sum(dtype=torch.float64))}" for name, value in sums.items())
         if visit in self.leading:
             return learned
         priors = self.priors
