@@ -10,8 +10,8 @@ from recon.misfit.base import Misfit, UniformImagesError
 from recon.misfit.level import image_means
 from recon.tiling.layout import Layout, Tile
 
-# Pixels of all images that the leaders have together, if there are so many: their noise is known to a tenth of a per
-# cent, and the weight of a whole field within some 20 %. A leader costs its tile half as many steps again.
+# Pixels of all images that the leaders have together, if there are so many: their noise, by which the weight goes, is
+# known to √(2/pixels), a tenth of a per cent. A leader costs its tile about half as many steps again.
 ENOUGH = 1_500_000
 
 # A leader shows at least this share of what the first one shows beyond the noise. An empty tile finds nothing.

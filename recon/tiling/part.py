@@ -62,8 +62,11 @@ def problem_of_tile(
     """
     if whole.setup.lamp is not None:
         raise ValueError("an uneven lamp that is given can't be cut into tiles; learn it")
-    # given weights of the priors are relative to the scale of the whole, and those that leaders find to their own
-    unit = whole.misfit if whole.weight is None else None if learned is None or priors is None else learned.misfit
+    unit = None  # the weight that a leader finds is relative to its own scale
+    if whole.weight is None:
+        unit = whole.misfit  # weights that are given are relative to that of the whole
+    elif learned is not None and priors is not None:
+        unit = learned.misfit
     misfit = whole.misfit.part(tile.rows.pixels, tile.columns.pixels, unit)
     setup = _setup(whole.setup, layout)
     unknowns = [with_support(u, lambda support: _with_margin(support, tile, layout.margin)) for u in whole.unknowns]

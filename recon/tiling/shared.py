@@ -2,8 +2,8 @@
 priors, one contrast that they know, and one value of what is learned beside Δn.
 
 The tiles whose images show most are the leaders. Each is fitted as any field is, but that the first one gives the
-others its scale and what it has learned. Each finds a weight by its own noise, and that is known to it only roughly:
-four of them find one within some 40 % of that of the whole field on either side, and their mean within 20 %.
+others what it has learned. Each finds a weight by its own noise, and that is known to it only roughly; their mean is
+known better, and all go by it.
 """
 
 import math
@@ -80,7 +80,7 @@ class SharedPriors:
 
     @classmethod
     def by(cls, findings: Sequence[Finding]) -> "SharedPriors":
-        """What leaders say together, each by its share of the specimen: the misfit hangs on the weight there alone."""
+        """What leaders say together, each by its share of the specimen: the misfit depends on the weight only there."""
         typical = _mean([finding.contrast for finding in findings], findings)
         told = [(f, f.weight, f.least) for f in findings if f.weight is not None and f.least is not None]
         if not told:

@@ -18,6 +18,7 @@ import tifffile
 import torch
 from results import RESULTS
 
+from recon.run.tiles.kept import TILES
 from torchdic.files.whole import PARTIAL
 
 # A module, or in place of it a script that breaks something and runs the module.
@@ -154,11 +155,11 @@ class Scene:
     def check_as_whole(self, out: Path, killed: bool = False) -> None:
         """What is in a folder is what the run to which nothing happened has left.
 
-        killed: whether it was, at its end, and may have left what the next run in the folder removes.
+        killed: whether it was, at its end, and may have left its tiles half removed, for the next run in the folder.
         """
         names = {path.name for path in out.iterdir()} - {".lock"}
         if killed:
-            names = {name for name in names if not name.startswith(PARTIAL)}
+            names.discard(f"{PARTIAL}{TILES}")
         assert names == self.launch.results
         for name in ("volume.ome.tif", "images.ome.tif"):
             ours, theirs = (tifffile.imread(folder / name) for folder in (out, self.whole))
